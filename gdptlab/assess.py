@@ -1,0 +1,140 @@
+"""Measured against true positions: matching, recall, precision, errors (Barnkob and Rossi, Exp. Fluids 61 (2020) 110)."""
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from gdptlab.check import positive, real_array
+
+AXES = {"dx_px": "x_px", "dy_px": "y_px", "dz_um": "z_um"}
+
+
+def match(
+    measured: pd.DataFrame, true: pd.DataFrame, *, within_px: float = 2.0, within_um: float = 10.0
+) -> pd.DataFrame:
+    """Pair measured with true particles, one to one, frame by frame, nearest in the plane first.
+
+    Parameters
+    ----------
+    measured, true : DataFrame
+        Columns `x_px`, `y_px`, `z_um`; with `frame` in both, or in neither (one frame).
+    within_px : float
+        Largest difference in x, and in y, of a pair.
+    within_um : float
+        Largest difference in z; a tenth of the measured height is usual.
+
+    Returns
+    -------
+    DataFrame
+        A row for each pair: `measured` and `true`, the row labels in the two tables, `dx_px`, `dy_px`,
+        `dz_um`, measured minus true, and `z_um`, the true depth.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, or row labels repeat.
+    """
+    positive("within_px", within_px)
+    positive("within_um", within_um)
+    for name, table in (("measured", measured), ("true", true)):
+        missing = set(AXES.values()) - set(table)
+        if missing:
+            raise ValueError(f"{name}: got no column {sorted(missing)}, needed are x_px, y_px and z_um")
+        if not table.index.is_unique:
+            raise ValueError(f"{name}: got row labels that repeat, allowed are unique ones (see reset_index)")
+    if ("frame" in measured) != ("frame" in true):
+        raise ValueError("measured, true: got a column frame in only one of them, allowed is in both or in neither")
+    if "frame" in true:
+        parts = [
+            _match_frame(measured[measured["frame"] == frame], part, within_px, within_um)
+            for frame, part in true.groupby("frame")
+        ]
+    else:
+        parts = [_match_frame(measured, true, within_px, within_um)]
+    return pd.concat(parts, ignore_index=True) if parts else _match_frame(measured, true, within_px, within_um)
+
+
+def _match_frame(measured: pd.DataFrame, true: pd.DataFrame, within_px: float, within_um: float) -> pd.DataFrame:
+    names = list(AXES.values())
+    here, there = (t[names].to_numpy(dtype=float) for t in (measured, true))
+    # In units of what is allowed, a pair is allowed if no difference is above 1.
+    scale = np.array([within_px, within_px, within_um])
+    near = KDTree(here / scale).query_ball_tree(KDTree(there / scale), 1, p=np.inf) if len(here) and len(there) else []
+    i = np.repeat(np.arange(len(near)), [len(n) for n in near]).astype(int)
+    j = np.array([k for n in near for k in n], dtype=int)
+    difference = here[i] - there[j]
+    free_here, free_there, chosen = np.ones(len(here), bool), np.ones(len(there), bool), []
+    for pair in np.argsort(np.hypot(difference[:, 0], difference[:, 1]), kind="stable"):
+        if free_here[i[pair]] and free_there[j[pair]]:
+            free_here[i[pair]] = free_there[j[pair]] = False
+            chosen.append(pair)
+    chosen = np.array(chosen, dtype=int)
+    pairs = {"measured": measured.index[i[chosen]], "true": true.index[j[chosen]]}
+    pairs |= dict(zip(AXES, difference[chosen].T, strict=True))
+    return pd.DataFrame(pairs | {"z_um": there[j[chosen], 2]})
+
+
+def scores(measured: pd.DataFrame, true: pd.DataFrame, *, within_px: float = 2.0, within_um: float = 10.0) -> pd.Series:
+    """Recall, precision and root-mean-square errors of a measurement.
+
+    Parameters
+    ----------
+    measured, true, within_px, within_um
+        As in `match`.
+
+    Returns
+    -------
+    Series
+        `n_true`, `n_measured`, `n_matched`; `recall` = matched / true and `precision` = matched / measured
+        (NaN if there are none to divide by); `sigma_x_px`, `sigma_y_px`, `sigma_z_um`, the RMS errors of the
+        pairs, and `bias_z_um`, their mean error in z (NaN without pairs).
+    """
+    pairs = match(measured, true, within_px=within_px, within_um=within_um)
+    return _summary(pairs, len(true), len(measured))
+
+
+def scores_by_z(
+    measured: pd.DataFrame, true: pd.DataFrame, edges_um: ArrayLike, *, within_px: float = 2.0, within_um: float = 10.0
+) -> pd.DataFrame:
+    """`scores` against depth.
+
+    Parameters
+    ----------
+    measured, true, within_px, within_um
+        As in `match`.
+    edges_um : array (n + 1,)
+        Increasing edges of the bins of z. True and matched particles are counted by their true depth, those
+        measured by their measured one.
+
+    Returns
+    -------
+    DataFrame
+        A row for each bin, with its middle in the first column, `z_um`, and the columns of `scores`.
+    """
+    edges = np.asarray(real_array("edges_um", edges_um, 1), dtype=float)
+    if len(edges) < 2 or (np.diff(edges) <= 0).any():
+        raise ValueError(f"edges_um: got {edges}, allowed are two or more increasing numbers")
+    pairs = match(measured, true, within_px=within_px, within_um=within_um)
+    parts = [pd.cut(t["z_um"], edges, labels=False, include_lowest=True) for t in (pairs, true, measured)]
+    rows = [
+        _summary(pairs[parts[0] == k], int((parts[1] == k).sum()), int((parts[2] == k).sum()))
+        for k in range(len(edges) - 1)
+    ]
+    return pd.DataFrame(rows).assign(z_um=(edges[1:] + edges[:-1]) / 2).set_index("z_um").reset_index()
+
+
+def _summary(pairs: pd.DataFrame, n_true: int, n_measured: int) -> pd.Series:
+    n = len(pairs)
+    root_mean_square = {f"sigma_{c[1:]}": np.sqrt((pairs[c] ** 2).mean()) for c in AXES}
+    return pd.Series(
+        {
+            "n_true": n_true,
+            "n_measured": n_measured,
+            "n_matched": n,
+            "recall": n / n_true if n_true else np.nan,
+            "precision": n / n_measured if n_measured else np.nan,
+            **root_mean_square,
+            "bias_z_um": pairs["dz_um"].mean(),
+        }
+    )

@@ -1,0 +1,361 @@
+"""The look-up table of GDPT: images of one particle at known depths, and what correlation makes of them.
+
+A calibration holds the recorded stack, a denoised copy of it that serves as templates, the subset of N_sub
+templates that a frame is correlated with, and the map of expected C_m profiles (the paper's Figure 2a).
+"""
+
+import os
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.fft import dctn, idctn
+from scipy.interpolate import make_smoothing_spline
+from scipy.ndimage import gaussian_filter
+from scipy.ndimage import shift as shift_image
+from skimage.registration import phase_cross_correlation
+
+from gdptlab.check import positive, real_array, whole
+from gdptlab.correlation import Correlator, normalised
+from gdptlab.files import written_whole
+
+VERSION = 1
+"""Of the file format of `Calibration.save`."""
+
+LOSSLESS = 0.98
+"""Templates that keep this correlation with themselves at half resolution are searched for there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Calibration stack, templates, subset and map. Made by `from_stack`, `from_scan` or `load`.
+
+    Attributes
+    ----------
+    stack : float32 array (N, n, n)
+        Images as recorded, the particle in the middle; n is odd.
+    z_um : float64 array (N,)
+        Their depths, increasing.
+    subset : int array (n_sub,)
+        Indices of the stack images that frames are correlated with.
+    templates : float32 array (N, n, n)
+        The stack, denoised, each image with mean 0 and norm 1.
+    """
+
+    stack: NDArray[np.float32]
+    z_um: NDArray[np.float64]
+    subset: NDArray[np.int64]
+    templates: NDArray[np.float32]
+    _plans: dict = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_stack(
+        cls,
+        stack: ArrayLike,
+        z_um: ArrayLike,
+        *,
+        n_sub: int = 9,
+        n: int | None = None,
+        denoise: bool = True,
+    ) -> Self:
+        """Calibrate with a stack that is already cut around one particle.
+
+        Parameters
+        ----------
+        stack : array (N, n, n)
+            Any real type; n odd, the particle in the middle.
+        z_um : array (N,)
+            Depths, strictly increasing or decreasing.
+        n_sub : int
+            How many images frames are correlated with, N_sub of the paper: those in the middle of n_sub equal
+            bins of the stack.
+        n : int, optional
+            Use only this many of the images, evenly spread from first to last (N of the paper's Figure 5).
+        denoise : bool
+            Replace the images by a smooth model of the stack (`denoised`) where they serve as templates. Noise
+            in the templates pulls z towards the sharp, bright ones.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the stack or z_um are not of that form, hold NaN, or an image is constant; if n or n_sub is out
+            of range.
+        """
+        stack = real_array("stack", stack, 3)
+        z_um = np.asarray(real_array("z_um", z_um, 1), dtype=np.float64)
+        if stack.shape[1] != stack.shape[2] or stack.shape[1] % 2 == 0:
+            raise ValueError(f"stack: got images of {stack.shape[1:]} px, allowed are square ones of odd size")
+        if len(stack) < 3:
+            raise ValueError(f"stack: got {len(stack)} images, allowed are 3 or more")
+        if len(z_um) != len(stack):
+            raise ValueError(f"z_um: got {len(z_um)} depths, needed is one for each of {len(stack)} images")
+        steps = np.diff(z_um)
+        if not ((steps > 0).all() or (steps < 0).all()):
+            raise ValueError("z_um: got depths that turn or repeat, allowed are strictly increasing or decreasing")
+        constant = np.flatnonzero(np.ptp(stack, axis=(1, 2)) == 0)
+        if len(constant):
+            raise ValueError(f"stack: got constant images at {constant.tolist()}, allowed are images with contrast")
+        n = len(stack) if n is None else whole("n", n, 3, len(stack))
+        n_sub = whole("n_sub", n_sub, 2, n)
+        order = np.argsort(z_um)[np.rint(np.linspace(0, len(stack) - 1, n)).astype(int)]
+        stack, z_um = stack[order], z_um[order]
+        subset = ((np.arange(n_sub) + 0.5) * n / n_sub).astype(np.int64)
+        return cls(stack, z_um, subset, normalised(denoised(stack) if denoise else stack))
+
+    @classmethod
+    def from_scan(
+        cls,
+        scan: ArrayLike,
+        z_um: ArrayLike,
+        x_px: float,
+        y_px: float,
+        *,
+        size: int | None = None,
+        n_sub: int = 9,
+        n: int | None = None,
+        denoise: bool = True,
+    ) -> Self:
+        """Calibrate with one particle of a scan of full frames.
+
+        The particle's centre is found in every slice as the point about which its image is symmetric (under
+        half a turn), made smooth over z, and every slice is moved so that it lies on the middle pixel.
+
+        Parameters
+        ----------
+        scan : array (N, rows, columns)
+            Frames at known depths; the particle should have no near neighbour.
+        z_um : array (N,)
+            Depths, strictly increasing or decreasing.
+        x_px, y_px : float
+            About where the particle is (to a few pixels).
+        size : int, optional
+            Rows and columns of the templates, odd. Without it, the smallest that holds the widest image.
+        n_sub, n, denoise
+            As in `from_stack`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `from_stack`; also if the particle is nearer to the border than half a template.
+        """
+        scan = real_array("scan", scan, 3)
+        z_um = np.asarray(real_array("z_um", z_um, 1), dtype=np.float64)
+        if len(z_um) != len(scan):
+            raise ValueError(f"z_um: got {len(z_um)} depths, needed is one for each of {len(scan)} frames")
+        rows, columns = scan.shape[1:]
+        x_px, y_px = positive("x_px", x_px, zero=True), positive("y_px", y_px, zero=True)
+        room = int(min(x_px, y_px, columns - 1 - x_px, rows - 1 - y_px)) - 2
+        if size is None:
+            size = _image_size(_cut(scan, x_px, y_px, max(room, 1)))
+        largest = 2 * room + 1
+        if not 3 <= size <= largest or size % 2 == 0:
+            raise ValueError(
+                f"size: got {size} px, allowed are odd sizes from 3 to {largest} "
+                f"for a particle at x_px = {x_px:g}, y_px = {y_px:g} in frames of {columns} by {rows} px"
+            )
+        centres = _centres(scan, z_um, x_px, y_px, size)
+        half = size // 2
+        stack = []
+        for frame, (x, y) in zip(scan, centres, strict=True):
+            moved = shift_image(frame, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
+            top, left = round(y_px) - half, round(x_px) - half
+            stack.append(moved[top : top + size, left : left + size])
+        return cls.from_stack(np.stack(stack), z_um, n_sub=n_sub, n=n, denoise=denoise)
+
+    def __len__(self) -> int:
+        return len(self.stack)
+
+    @property
+    def size(self) -> int:
+        """Rows and columns of a template, px."""
+        return self.stack.shape[-1]
+
+    @cached_property
+    def half_resolution(self) -> bool:
+        """Whether particles can be searched for at half resolution without loss."""
+        original = _even_centre(self.templates)
+        m = original.shape[-1]
+        restored = np.stack([cv2.pyrUp(half)[:m, :m] for half in _halved(self.templates)])
+        kept = np.einsum("kij,kij->k", normalised(restored), normalised(original))
+        return bool(kept.min() >= LOSSLESS)
+
+    @cached_property
+    def search_templates(self) -> NDArray[np.float32]:
+        """Templates at the resolution of the search, (N, m, m), each with mean 0 and norm 1."""
+        return normalised(_halved(self.templates)) if self.half_resolution else self.templates
+
+    @cached_property
+    def expected(self) -> NDArray[np.float32]:
+        """Map of expected C_m profiles, (N, n_sub): every stack image correlated with the subset (Figure 2a).
+
+        Where an image meets itself the correlation is 1 whatever its noise, which no measured particle can
+        match; the entry is replaced by a parabola through its neighbours along z.
+        """
+        images = normalised(_halved(self.stack)) if self.half_resolution else normalised(self.stack)
+        map_ = np.einsum("nij,sij->ns", images, self.search_templates[self.subset]).astype(np.float32)
+        for column, k in enumerate(self.subset):
+            near = np.array([i for i in range(k - 2, k + 3) if i != k and 0 <= i < len(self)])
+            if len(near) >= 3:
+                z0 = self.z_um[k]
+                map_[k, column] = np.polyfit(self.z_um[near] - z0, map_[near, column], 2)[-1]
+        return np.minimum(map_, 1)
+
+    def correlator(self, shape: tuple[int, int]) -> Correlator:
+        """Plan for correlating frames of this shape with the subset, kept for the next frame."""
+        if shape not in self._plans:
+            self._plans[shape] = Correlator(self.search_templates[self.subset], shape)
+        return self._plans[shape]
+
+    def self_similarity(self) -> NDArray[np.float32]:
+        """Correlation of every template with every other, (N, N): what can be told apart, and what cannot."""
+        flat = self.templates.reshape(len(self), -1)
+        return flat @ flat.T
+
+    def signal_to_noise(self) -> NDArray[np.float64]:
+        """Largest deviation of each denoised image from its median, over the noise of a pixel; (N,)."""
+        smooth = denoised(self.stack)
+        contrast = np.abs(smooth - np.median(smooth, axis=(1, 2), keepdims=True)).max(axis=(1, 2))
+        noise = noise_level(self.stack)
+        return contrast.astype(np.float64) / noise if noise > 0 else np.full(len(self), np.inf)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the calibration to a `.npz` file, whole or not at all."""
+        path = Path(path)
+        if path.suffix != ".npz":
+            raise ValueError(f"path: got {path.name!r}, allowed are names that end in .npz")
+        with written_whole(path) as temporary:
+            np.savez_compressed(
+                temporary,
+                gdptlab_calibration=VERSION,
+                stack=self.stack,
+                z_um=self.z_um,
+                subset=self.subset,
+                templates=self.templates,
+            )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Self:
+        """Read a calibration that `save` wrote.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ValueError
+            If it is damaged, of another version, or no calibration.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                data = {name: file[name] for name in file.files}
+        except FileNotFoundError:
+            raise
+        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+            raise ValueError(f"path: got {Path(path).name!r}, which cannot be read as a calibration: {error}") from error
+        version = data.pop("gdptlab_calibration", None)
+        if version is None or version != VERSION or set(data) != {"stack", "z_um", "subset", "templates"}:
+            raise ValueError(
+                f"path: got {Path(path).name!r} of version {version}, allowed are calibration files of version {VERSION}"
+            )
+        return cls(**data)
+
+
+def denoised(stack: NDArray) -> NDArray[np.float32]:
+    """Smooth model of a stack: its leading singular images, each freed of noise.
+
+    Singular images are kept while they stand out of the noise (the largest singular value of a matrix of noise
+    alone is about sigma (sqrt(N) + sqrt(pixels))). What noise is left in them is white and of known strength;
+    a Wiener filter, whose signal spectrum is the image's own, smoothed, less that noise, removes most of it.
+
+    Parameters
+    ----------
+    stack : array (N, n, n)
+
+    Returns
+    -------
+    float32 array (N, n, n)
+    """
+    flat = stack.reshape(len(stack), -1).astype(np.float64)
+    means = flat.mean(axis=1, keepdims=True)
+    left, values, right = np.linalg.svd(flat - means, full_matrices=False)
+    noise = noise_level(stack)
+    kept = max(int(np.sum(values > noise * (np.sqrt(flat.shape[0]) + np.sqrt(flat.shape[1])))), 1)
+    spectra = dctn(right[:kept].reshape(kept, *stack.shape[1:]), axes=(1, 2), norm="ortho")
+    power = gaussian_filter(spectra**2, (0, 2, 2), mode="nearest")
+    signal = np.maximum(power - (noise / values[:kept, None, None]) ** 2, 0)
+    images = idctn(spectra * signal / power, axes=(1, 2), norm="ortho").reshape(kept, -1)
+    return ((left[:, :kept] * values[:kept]) @ images + means).reshape(stack.shape).astype(np.float32)
+
+
+def noise_level(images: NDArray) -> float:
+    """Standard deviation of the noise of a pixel, from differences that smooth structure does not reach.
+
+    Parameters
+    ----------
+    images : array (..., rows, columns)
+
+    Returns
+    -------
+    float
+        From the median size of mixed second differences, which few sharp edges do not move.
+    """
+    mixed = np.diff(np.diff(np.asarray(images, dtype=np.float64), axis=-1), axis=-2)
+    return float(np.median(np.abs(mixed)) / (2 * 0.6745))
+
+
+def _even_centre(images: NDArray) -> NDArray:
+    """Trim odd-sized images by a pixel all round if need be, so that their middle has an even index."""
+    return images if (images.shape[-1] // 2) % 2 == 0 else images[:, 1:-1, 1:-1]
+
+
+def _halved(images: NDArray) -> NDArray[np.float32]:
+    """Images at half resolution, the middle pixel of the large on that of the small."""
+    return np.stack([cv2.pyrDown(np.ascontiguousarray(image)) for image in _even_centre(images)])
+
+
+def _cut(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
+    x, y = round(x_px), round(y_px)
+    return scan[:, y - half : y + half + 1, x - half : x + half + 1]
+
+
+def _image_size(cut: NDArray, faint: float = 0.08) -> int:
+    """Smallest odd size that holds the particle in every slice of (N, 2 r + 1, 2 r + 1).
+
+    An image ends where the mean over a ring about the centre first falls below the share `faint` of the
+    brightest ring's.
+    """
+    half = cut.shape[-1] // 2
+    y, x = np.indices(cut.shape[1:]) - half
+    ring = np.rint(np.hypot(x, y)).astype(int).ravel()
+    inside = ring <= half
+    count = np.bincount(ring[inside])
+    reach = 1
+    for image in denoised(cut):
+        light = image - np.median(np.concatenate([image[[0, -1]].ravel(), image[:, [0, -1]].ravel()]))
+        profile = np.abs(np.bincount(ring[inside], weights=light.ravel()[inside]) / count)
+        brightest = int(profile.argmax())
+        faint_from = np.flatnonzero(profile[brightest:] < faint * profile[brightest])
+        reach = max(reach, brightest + int(faint_from[0]) if len(faint_from) else half)
+    return 2 * min(reach + 1, half) + 1
+
+
+def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) -> NDArray[np.float64]:
+    """Centre (x, y) of the particle in every slice, (N, 2), px."""
+    cut = _cut(scan, x_px, y_px, size // 2)
+    cut = cut - np.median(cut, axis=(1, 2), keepdims=True)
+    shifts = [
+        # Half a turn about the middle moves an image that is symmetric about c by -2 c.
+        phase_cross_correlation(image, image[::-1, ::-1], upsample_factor=100, normalization=None)[0] / 2
+        for image in cut
+    ]
+    order = np.argsort(z_um)
+    weight = np.einsum("kij,kij->k", cut, cut)[order]
+    offsets = np.empty((len(scan), 2))
+    for axis, values in enumerate(np.asarray(shifts).T):
+        if len(scan) >= 5:
+            values[order] = make_smoothing_spline(z_um[order], values[order], w=weight / weight.max())(z_um[order])
+        offsets[:, axis] = values
+    return offsets[:, ::-1] + (round(x_px), round(y_px))

@@ -1,0 +1,80 @@
+"""Checks of arguments: each names the argument, what came and what is allowed."""
+
+import math
+from collections.abc import Iterable
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def positive(name: str, value: Any, *, zero: bool = False) -> float:
+    """Return `value` as a float if it is a finite number above zero (or zero, if allowed).
+
+    Raises
+    ------
+    TypeError
+        If `value` is not a real number.
+    ValueError
+        If it is not finite, negative, or zero where that is not allowed.
+    """
+    allowed = "a finite number, at least 0" if zero else "a finite number above 0"
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"{name}: got {value!r}, allowed is {allowed}")
+    if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
+        raise ValueError(f"{name}: got {value!r}, allowed is {allowed}")
+    return float(value)
+
+
+def whole(name: str, value: Any, low: int, high: int) -> int:
+    """Return `value` as an int if it is a whole number from `low` to `high`.
+
+    Raises
+    ------
+    TypeError
+        If `value` is not a whole number.
+    ValueError
+        If it is out of range.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        raise TypeError(f"{name}: got {value!r}, allowed are whole numbers from {low} to {high}")
+    if not low <= value <= high:
+        raise ValueError(f"{name}: got {value}, allowed are whole numbers from {low} to {high}")
+    return int(value)
+
+
+def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
+    """Return `value` if it is one of the `allowed` words.
+
+    Raises
+    ------
+    ValueError
+        If it is not.
+    """
+    allowed = list(allowed)
+    if value not in allowed:
+        raise ValueError(f"{name}: got {value!r}, allowed are {', '.join(map(repr, allowed))}")
+    return value
+
+
+def real_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
+    """Return `value` as a finite float32 array of `ndim` axes, none of them empty.
+
+    Raises
+    ------
+    TypeError
+        If `value` does not hold real numbers.
+    ValueError
+        If it has another number of axes, is empty, or holds NaN or infinity.
+    """
+    array = np.asarray(value)
+    if array.dtype.kind not in "buif":
+        raise TypeError(f"{name}: got values of type {array.dtype}, allowed are real numbers")
+    if array.ndim != ndim or 0 in array.shape:
+        raise ValueError(f"{name}: got shape {array.shape}, allowed are {ndim} axes, none of them empty")
+    with np.errstate(over="ignore"):
+        array = np.ascontiguousarray(array, dtype=np.float32)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: got NaN or infinity, allowed are finite numbers that fit into float32")
+    return array

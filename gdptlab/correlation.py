@@ -1,0 +1,120 @@
+"""Normalised cross-correlation of one image with many small templates (Lewis 1995; the paper's Figure 2d).
+
+`Correlator` is the fast kernel, `correlate_plainly` the formula written out, which it is tested against. Both
+return the value for every position at which the whole template lies inside the image: entry [r, c] belongs to
+the window whose first pixel is (r, c), so its centre is (r + n // 2, c + n // 2) for templates n pixels wide.
+"""
+
+import cv2
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+FLAT = 1e-4
+"""A window whose contrast is below this share of the image's is taken as flat: its correlation is 0."""
+
+
+def normalised(images: NDArray) -> NDArray[np.float32]:
+    """Subtract each image's mean and divide by its norm; a flat image becomes zero.
+
+    Parameters
+    ----------
+    images : array (..., rows, columns)
+
+    Returns
+    -------
+    float32 array (..., rows, columns)
+    """
+    centred = images - images.mean(axis=(-2, -1), keepdims=True)
+    norm = np.sqrt(np.einsum("...ij,...ij->...", centred, centred))[..., None, None]
+    return (centred / np.where(norm > 0, norm, 1)).astype(np.float32)
+
+
+class Correlator:
+    """Plan for correlating frames of one shape with a set of templates.
+
+    One Fourier transform of the frame serves all templates, whose own are kept, and so do its local sums.
+
+    Parameters
+    ----------
+    templates : array (k, n, n)
+    shape : (rows, columns)
+        Of the frames; no smaller than a template.
+    """
+
+    def __init__(self, templates: NDArray, shape: tuple[int, int]) -> None:
+        self._n = templates.shape[-1]
+        self._shape = shape
+        # Wrapping around spoils only positions at which the template would leave the frame.
+        self._padded = tuple(cv2.getOptimalDFTSize(n) for n in shape)
+        self._spectra = [cv2.dft(self._pad(t)) for t in normalised(templates)]
+
+    def _pad(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        rows, columns = (p - n for p, n in zip(self._padded, image.shape, strict=True))
+        return cv2.copyMakeBorder(image, 0, rows, 0, columns, cv2.BORDER_CONSTANT, value=0)
+
+    def __call__(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Correlate.
+
+        Parameters
+        ----------
+        image : float32 array (rows, columns)
+
+        Returns
+        -------
+        float32 array (k, rows - n + 1, columns - n + 1)
+            From -1 to 1; 0 where the image is flat.
+        """
+        image = image - image.mean(dtype=np.float64).astype(np.float32)
+        n, (rows, columns) = self._n, (m - self._n + 1 for m in self._shape)
+        spectrum = cv2.dft(self._pad(image))
+        per_norm = 1 / local_norm(image, n)
+        maps = np.empty((len(self._spectra), rows, columns), dtype=np.float32)
+        for map_, template in zip(maps, self._spectra, strict=True):
+            product = cv2.mulSpectrums(spectrum, template, 0, conjB=True)
+            full = cv2.idft(product, flags=cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
+            np.multiply(full[:rows, :columns], per_norm, out=map_)
+        return maps
+
+
+def local_norm(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+    """Norm of every n by n window about its own mean; infinite where the window is flat.
+
+    Parameters
+    ----------
+    image : float32 array (rows, columns)
+        With a mean near zero, so that squares lose no digits.
+    n : int
+
+    Returns
+    -------
+    float32 array (rows - n + 1, columns - n + 1)
+    """
+    inside = slice(n // 2, image.shape[0] - (n - 1) // 2), slice(n // 2, image.shape[1] - (n - 1) // 2)
+    mean = cv2.boxFilter(image, cv2.CV_32F, (n, n))[inside]
+    square = cv2.sqrBoxFilter(image, cv2.CV_32F, (n, n))[inside]
+    variance = square - mean**2
+    floor = (FLAT * image.std(dtype=np.float64)) ** 2
+    return np.where(variance > floor, n * np.sqrt(np.maximum(variance, 0)), np.inf).astype(np.float32)
+
+
+def correlate_plainly(image: NDArray, templates: NDArray) -> NDArray[np.float64]:
+    """Normalised cross-correlation by its definition, window by window (slow).
+
+    Parameters
+    ----------
+    image : array (rows, columns)
+    templates : array (k, n, n)
+
+    Returns
+    -------
+    float64 array (k, rows - n + 1, columns - n + 1)
+        From -1 to 1; 0 where image or template is flat.
+    """
+    windows = sliding_window_view(np.asarray(image, dtype=np.float64), templates.shape[-2:])
+    windows = windows - windows.mean(axis=(-2, -1), keepdims=True)
+    norm = np.sqrt((windows**2).sum(axis=(-2, -1)))
+    templates = templates - templates.mean(axis=(-2, -1), keepdims=True)
+    scaled = np.einsum("rcij,kij->krc", windows, templates)
+    product = norm * np.sqrt((templates**2).sum(axis=(-2, -1)))[:, None, None]
+    return np.divide(scaled, product, out=np.zeros_like(scaled), where=product > 0)

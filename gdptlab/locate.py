@@ -1,0 +1,268 @@
+"""From a frame to a table of particles, by correlation and without segmentation (the paper's section 2).
+
+1. The frame is correlated with the N_sub images of the calibration's subset (Figure 2b).
+2. Candidates are local peaks, in any of the maps, above a threshold.
+3. A candidate's profile is the highest C_m in each map within two pixels of the peak (Figure 2c). The
+   neighbourhood matters: maps of sharp templates have narrow peaks that a pixel's offset would miss.
+4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, which is blind
+   to the noise that lowers the whole profile; a parabola through the best three gives the part of a step.
+5. Refinement: the candidate's window is correlated with stack images from the guess onward, uphill along z
+   until C_m no longer rises; then parabolas through neighbouring positions and depths.
+6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
+
+A particle is measured only if its whole window lies in the frame; nothing is said of a border half a
+template wide.
+"""
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+import pandas as pd
+from joblib import Parallel, delayed
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+from tqdm.auto import tqdm
+
+from gdptlab.calibration import Calibration
+from gdptlab.check import positive, real_array, whole
+
+
+COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
+"""Columns of the table that `locate` returns, and their types."""
+
+CROSS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
+"""A pixel and its four neighbours, (row, column)."""
+
+
+def locate(
+    image: ArrayLike,
+    calibration: Calibration,
+    *,
+    threshold: float = 0.5,
+    refine: bool = True,
+    min_distance_px: float | None = None,
+) -> pd.DataFrame:
+    """Measure x, y and z of every particle in a frame.
+
+    Parameters
+    ----------
+    image : array (rows, columns)
+        Any real type, no smaller than a template.
+    calibration : Calibration
+    threshold : float
+        Lowest C_m of a particle, above 0, at most 1.
+    refine : bool
+        Walk along the whole stack to the best C_m. Without it, z comes from the subset's profile alone.
+    min_distance_px : float, optional
+        Nearest that two particles can be told apart; a quarter of a template if not given.
+
+    Returns
+    -------
+    DataFrame
+        A row for each particle, highest C_m first. `x_px` to the right and `y_px` down, the first pixel's
+        centre at (0, 0); `z_um` in the depths of the calibration; `cm`, the correlation with the best image;
+        `at_end`, whether that is the stack's first or last image, so that z may lie beyond it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not of that form, or the image holds NaN or infinity.
+
+    Examples
+    --------
+    >>> import gdptlab
+    >>> from gdptlab import datasets
+    >>> sample = datasets.sample("fluorescent")
+    >>> calibration = gdptlab.Calibration.from_stack(sample.stack, sample.z_um)
+    >>> table = gdptlab.locate(sample.frames[0], calibration)
+    >>> list(table)
+    ['x_px', 'y_px', 'z_um', 'cm', 'at_end']
+    """
+    image = real_array("image", image, 2)
+    size = calibration.size
+    if min(image.shape) < size:
+        raise ValueError(f"image: got shape {image.shape}, allowed is no smaller than a template, {(size, size)}")
+    if not 0 < positive("threshold", threshold) <= 1:
+        raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
+    distance = size / 4 if min_distance_px is None else positive("min_distance_px", min_distance_px, zero=True)
+    image = image - image.mean(dtype=np.float64).astype(np.float32)
+    found = _candidates(image, calibration, threshold)
+    x, y, step, cm = _refined(image, calibration, *found[:3]) if refine else found
+    kept = _strongest(x, y, np.where(cm >= threshold, cm, 0), distance)
+    x, y, step, cm = (values[kept] for values in (x, y, step, cm))
+    last = len(calibration) - 1
+    return pd.DataFrame(
+        {
+            "x_px": x.astype(float),
+            "y_px": y.astype(float),
+            "z_um": np.interp(step, np.arange(last + 1), calibration.z_um),
+            "cm": np.minimum(cm, 1).astype(float),
+            "at_end": (step <= 0) | (step >= last),
+        }
+    )
+
+
+def _candidates(
+    image: NDArray[np.float32], calibration: Calibration, threshold: float
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Peaks of the correlation maps: x, y (px), z (steps of the stack), C_m, each (n,)."""
+    scale, near = (2, 1) if calibration.half_resolution else (1, 2)
+    searched = cv2.pyrDown(image) if scale == 2 else image
+    maps = calibration.correlator(searched.shape)(searched)
+    highest = maps.max(axis=0)
+    peak = (highest >= threshold) & (highest == cv2.dilate(highest, np.ones((5, 5), np.uint8)))
+    # A peak on the rim of a map is the flank of one outside: its place is unknown.
+    peak[:near], peak[-near:], peak[:, :near], peak[:, -near:] = False, False, False, False
+    row, column = np.nonzero(peak)
+    around = np.arange(-near, near + 1)
+    patches = maps[:, row[:, None, None] + around[:, None], column[:, None, None] + around]
+    profile = patches.max(axis=(2, 3)).T
+    best = profile.argmax(axis=1)
+
+    likeness = _standardised(profile) @ _standardised(calibration.expected).T
+    k = np.clip(likeness.argmax(axis=1), 1, len(calibration) - 2)
+    step = k + _vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])[0]
+
+    cross = maps[best[:, None], row[:, None] + CROSS[:, 0], column[:, None] + CROSS[:, 1]]
+    y = row + _vertex(cross[:, [1, 0, 2]])[0]
+    x = column + _vertex(cross[:, [3, 0, 4]])[0]
+    middle = calibration.search_templates.shape[-1] // 2
+    return scale * (x + middle), scale * (y + middle), step, profile[np.arange(len(row)), best]
+
+
+def _refined(
+    image: NDArray[np.float32], calibration: Calibration, x: NDArray, y: NDArray, step: NDArray
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Walk every candidate uphill, along the stack and to neighbouring pixels, to its best C_m (0: none)."""
+    half, last = calibration.size // 2, len(calibration) - 1
+    windows = sliding_window_view(image, (calibration.size, calibration.size))
+    templates = calibration.templates.reshape(last + 1, -1)
+    low, high = 1, np.array(windows.shape[:2]) - 2
+    place = np.clip(np.rint(np.stack([y, x], axis=1) - half).astype(int), low, high)
+    step = _uphill(_correlations(windows, place, templates), np.clip(np.rint(step).astype(int), 0, last))
+    scores = np.zeros((len(place), len(CROSS), 3), dtype=np.float32)
+    walking = np.arange(len(place))
+    for _ in range(half):  # who walks farther than half a template follows no particle
+        depths = np.clip(step[walking, None] + (-1, 0, 1), 0, last)
+        near = place[walking, None] + CROSS
+        now = _correlations(windows, near, templates[depths])
+        scores[walking] = now
+        flat = now.reshape(len(now), -1)
+        better = np.flatnonzero(flat.max(axis=1) > now[:, 0, 1])
+        to, k = np.unravel_index(flat[better].argmax(axis=1), now.shape[1:])
+        walking = walking[better]
+        place[walking], step[walking] = near[better, to], depths[better, k]
+        leaves = ((place[walking] < low) | (place[walking] > high)).any(axis=1)
+        scores[walking[leaves]] = 0
+        walking = walking[~leaves]
+        if not len(walking):
+            break
+    down, up_by = _vertex(scores[:, [1, 0, 2]].swapaxes(1, 2))
+    across, over_by = _vertex(scores[:, [3, 0, 4]].swapaxes(1, 2))
+    along, rise = _vertex(scores[:, 0] + up_by + over_by)
+    inner = (step > 0) & (step < last)
+    return (
+        place[:, 1] + half + across[:, 1],
+        place[:, 0] + half + down[:, 1],
+        step + np.where(inner, along, 0),
+        scores[:, 0, 1] + up_by[:, 1] + over_by[:, 1] + np.where(inner, rise, 0),
+    )
+
+
+def _correlations(windows: NDArray, place: NDArray, templates: NDArray) -> NDArray[np.float32]:
+    """Correlate the windows at places (n, ..., 2) with templates (k, pixels) or (n, k, pixels)."""
+    images = windows[place[..., 0], place[..., 1]].reshape(*place.shape[:-1], -1)
+    squares = np.einsum("...p,...p->...", images, images) - images.sum(axis=-1) ** 2 / images.shape[-1]
+    norm = np.sqrt(np.where(squares > 0, squares, np.inf))
+    return images @ templates.swapaxes(-1, -2) / norm[..., None]
+
+
+def _uphill(scores: NDArray, step: NDArray) -> NDArray:
+    """Climb along each row of `scores` (n, N) from `step` (n,) to the nearest local maximum."""
+    rows, last = np.arange(len(scores)), scores.shape[1] - 1
+    for _ in range(last):
+        around = np.clip(step[:, None] + (0, -1, 1), 0, last)
+        higher = around[rows, scores[rows[:, None], around].argmax(axis=1)]
+        if (higher == step).all():
+            break
+        step = higher
+    return step
+
+
+def _vertex(values: NDArray) -> tuple[NDArray, NDArray]:
+    """Parabola through three values, (..., 3), at -1, 0, 1: place of its top, and how far that is above the middle.
+
+    Where the middle is not the highest the top is taken to be at the nearest end of (-1/2, 1/2).
+    """
+    before, here, after = np.moveaxis(values, -1, 0)
+    bend = before + after - 2 * here
+    slope = (after - before) / 2
+    place = np.clip(np.divide(-slope, bend, out=np.sign(slope) / 2, where=bend < 0), -0.5, 0.5)
+    return place, place * slope + place**2 * bend / 2
+
+
+def _standardised(profiles: NDArray) -> NDArray:
+    """Rows with mean 0 and norm 1."""
+    centred = profiles - profiles.mean(axis=1, keepdims=True)
+    norm = np.linalg.norm(centred, axis=1, keepdims=True)
+    return centred / np.where(norm > 0, norm, 1)
+
+
+def _strongest(x: NDArray, y: NDArray, cm: NDArray, distance: float) -> NDArray[np.int64]:
+    """Indices by falling C_m, without those nearer than `distance` to a stronger one, or with none."""
+    points = np.column_stack([x, y])
+    near = KDTree(points).query_ball_point(points, distance) if len(points) else []
+    taken = cm <= 0
+    kept = []
+    for i in np.argsort(-cm, kind="stable"):
+        if not taken[i]:
+            kept.append(i)
+            taken[near[i]] = True
+    return np.array(kept, dtype=np.int64)
+
+
+def batch(
+    frames: Iterable[ArrayLike],
+    calibration: Calibration,
+    *,
+    n_jobs: int = 1,
+    progress: bool = True,
+    **settings: object,
+) -> pd.DataFrame:
+    """Measure every particle in every frame.
+
+    Parameters
+    ----------
+    frames : iterable of arrays (rows, columns)
+        A list, a stack, a generator: read one by one, so that a film need not fit into memory.
+    calibration : Calibration
+    n_jobs : int
+        Processes to spread the frames over; -1 for one per core. The result does not depend on it.
+    progress : bool
+        Show a progress bar.
+    **settings
+        Of `locate`.
+
+    Returns
+    -------
+    DataFrame
+        As from `locate`, with the number of the frame (from 0) in the first column, `frame`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `locate`, for the first frame that is refused.
+    """
+    if n_jobs != -1:
+        whole("n_jobs", n_jobs, 1, 10_000)
+    total = len(frames) if hasattr(frames, "__len__") else None
+    jobs = (delayed(locate)(frame, calibration, **settings) for frame in frames)
+    tables = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
+    numbered = [
+        table.assign(frame=number)
+        for number, table in enumerate(tqdm(tables, total=total, desc="frames", unit="frame", disable=not progress))
+    ]
+    empty = pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in (COLUMNS | {"frame": int}).items()})
+    return pd.concat(numbered or [empty], ignore_index=True)[["frame", *COLUMNS]]

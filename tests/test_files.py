@@ -1,0 +1,49 @@
+"""Files appear whole or not at all."""
+
+from pathlib import Path
+
+import pytest
+
+from gdptlab.files import written_whole
+
+
+def test_content_arrives_under_the_name_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "stack.tif"
+    with written_whole(path) as temporary:
+        temporary.write_text("new")
+        assert not path.exists()
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".tif"
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_error_leaves_the_old_file_and_nothing_else(tmp_path: Path, error: type[BaseException]) -> None:
+    path = tmp_path / "stack.tif"
+    path.write_text("old")
+    with pytest.raises(error), written_whole(path) as temporary:
+        temporary.write_text("half")
+        raise error
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_two_writers_do_not_share_a_temporary_file(tmp_path: Path) -> None:
+    path = tmp_path / "cache.npz"
+    with written_whole(path) as first, written_whole(str(path)) as second:
+        first.write_text("first")
+        second.write_text("second")
+    assert path.read_text() == "first"  # the last to finish
+
+
+def test_no_folder_is_created(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="must lie in a folder that exists"):
+        with written_whole(tmp_path / "absent" / "stack.tif"):
+            pytest.fail("the block should not run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writing_nothing_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), written_whole(tmp_path / "stack.tif"):
+        pass
