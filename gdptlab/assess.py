@@ -1,4 +1,7 @@
-"""Measured against true positions: matching, recall, precision, errors (Barnkob and Rossi, Exp. Fluids 61 (2020) 110)."""
+"""Measured against true positions: matching, recall, precision, errors.
+
+As in the standard assessment of R. Barnkob and M. Rossi, Exp. Fluids 61 (2020) 110.
+"""
 
 import numpy as np
 import pandas as pd
@@ -18,7 +21,7 @@ def match(
     Parameters
     ----------
     measured, true : DataFrame
-        Columns `x_px`, `y_px`, `z_um`; with `frame` in both, or in neither (one frame).
+        Columns `x_px`, `y_px`, `z_um`; with `frame` in both, or in neither (one frame). Rows with NaN have no pair.
     within_px : float
         Largest difference in x, and in y, of a pair.
     within_um : float
@@ -56,8 +59,8 @@ def match(
 
 
 def _match_frame(measured: pd.DataFrame, true: pd.DataFrame, within_px: float, within_um: float) -> pd.DataFrame:
-    names = list(AXES.values())
-    here, there = (t[names].to_numpy(dtype=float) for t in (measured, true))
+    measured, true = (t.loc[np.isfinite(t[list(AXES.values())]).all(axis=1)] for t in (measured, true))
+    here, there = (t[list(AXES.values())].to_numpy(dtype=float) for t in (measured, true))
     # In units of what is allowed, a pair is allowed if no difference is above 1.
     scale = np.array([within_px, within_px, within_um])
     near = KDTree(here / scale).query_ball_tree(KDTree(there / scale), 1, p=np.inf) if len(here) and len(there) else []
@@ -95,7 +98,12 @@ def scores(measured: pd.DataFrame, true: pd.DataFrame, *, within_px: float = 2.0
 
 
 def scores_by_z(
-    measured: pd.DataFrame, true: pd.DataFrame, edges_um: ArrayLike, *, within_px: float = 2.0, within_um: float = 10.0
+    measured: pd.DataFrame,
+    true: pd.DataFrame,
+    edges_um: ArrayLike,
+    *,
+    within_px: float = 2.0,
+    within_um: float = 10.0,
 ) -> pd.DataFrame:
     """`scores` against depth.
 

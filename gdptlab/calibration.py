@@ -104,7 +104,7 @@ class Calibration:
         order = np.argsort(z_um)[np.rint(np.linspace(0, len(stack) - 1, n)).astype(int)]
         stack, z_um = stack[order], z_um[order]
         subset = ((np.arange(n_sub) + 0.5) * n / n_sub).astype(np.int64)
-        return cls(stack, z_um, subset, normalised(denoised(stack) if denoise else stack))
+        return cls(stack, z_um, subset, normalised(levelled(denoised(stack) if denoise else stack)))
 
     @classmethod
     def from_scan(
@@ -195,7 +195,8 @@ class Calibration:
         Where an image meets itself the correlation is 1 whatever its noise, which no measured particle can
         match; the entry is replaced by a parabola through its neighbours along z.
         """
-        images = normalised(_halved(self.stack)) if self.half_resolution else normalised(self.stack)
+        images = levelled(self.stack)
+        images = normalised(_halved(images) if self.half_resolution else images)
         map_ = np.einsum("nij,sij->ns", images, self.search_templates[self.subset]).astype(np.float32)
         for column, k in enumerate(self.subset):
             near = np.array([i for i in range(k - 2, k + 3) if i != k and 0 <= i < len(self)])
@@ -203,6 +204,11 @@ class Calibration:
                 z0 = self.z_um[k]
                 map_[k, column] = np.polyfit(self.z_um[near] - z0, map_[near, column], 2)[-1]
         return np.minimum(map_, 1)
+
+    @cached_property
+    def solvers(self) -> NDArray[np.float32]:
+        """`displacement_solvers` of the templates, (N, 4, n * n)."""
+        return displacement_solvers(self.templates, self.z_um)
 
     def correlator(self, shape: tuple[int, int]) -> Correlator:
         """Plan for correlating frames of this shape with the subset, kept for the next frame."""
@@ -254,21 +260,22 @@ class Calibration:
         except FileNotFoundError:
             raise
         except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ValueError(f"path: got {Path(path).name!r}, which cannot be read as a calibration: {error}") from error
+            raise ValueError(
+                f"path: got {Path(path).name!r}, which cannot be read as a calibration: {error}"
+            ) from error
         version = data.pop("gdptlab_calibration", None)
         if version is None or version != VERSION or set(data) != {"stack", "z_um", "subset", "templates"}:
-            raise ValueError(
-                f"path: got {Path(path).name!r} of version {version}, allowed are calibration files of version {VERSION}"
-            )
+            name = Path(path).name
+            raise ValueError(f"path: got {name!r} of version {version}, allowed are calibrations of version {VERSION}")
         return cls(**data)
 
 
 def denoised(stack: NDArray) -> NDArray[np.float32]:
-    """Smooth model of a stack: its leading singular images, each freed of noise.
+    """Smooth model of a stack: low rank, then Wiener-filtered along z and in each image.
 
     Singular images are kept while they stand out of the noise (the largest singular value of a matrix of noise
-    alone is about sigma (sqrt(N) + sqrt(pixels))). What noise is left in them is white and of known strength;
-    a Wiener filter, whose signal spectrum is the image's own, smoothed, less that noise, removes most of it.
+    alone is about sigma (sqrt(N) + sqrt(pixels))). White noise of known strength is left in their coefficients
+    and in every image; it is filtered out by what the cosine spectrum of each holds above it.
 
     Parameters
     ----------
@@ -283,11 +290,67 @@ def denoised(stack: NDArray) -> NDArray[np.float32]:
     left, values, right = np.linalg.svd(flat - means, full_matrices=False)
     noise = noise_level(stack)
     kept = max(int(np.sum(values > noise * (np.sqrt(flat.shape[0]) + np.sqrt(flat.shape[1])))), 1)
-    spectra = dctn(right[:kept].reshape(kept, *stack.shape[1:]), axes=(1, 2), norm="ortho")
-    power = gaussian_filter(spectra**2, (0, 2, 2), mode="nearest")
-    signal = np.maximum(power - (noise / values[:kept, None, None]) ** 2, 0)
-    images = idctn(spectra * signal / power, axes=(1, 2), norm="ortho").reshape(kept, -1)
-    return ((left[:, :kept] * values[:kept]) @ images + means).reshape(stack.shape).astype(np.float32)
+    coefficients = _wiener((left[:, :kept] * values[:kept]).T, noise**2)
+    images = (coefficients.T @ right[:kept] + means).reshape(stack.shape)
+    share = (left[:, :kept] ** 2).sum(axis=1)  # of the noise of each image that the singular images carry
+    return _wiener(images, share[:, None, None] * noise**2).astype(np.float32)
+
+
+def _wiener(signals: NDArray, noise_variance: float | NDArray) -> NDArray:
+    """Wiener filter for each of `signals` (k, ...) with white noise, in the basis of cosines.
+
+    The power spectrum is the signal's own, smoothed. As that still scatters by a quarter, half as much noise
+    again is taken from it, so that of noise alone next to nothing is left.
+    """
+    axes = tuple(range(1, signals.ndim))
+    spectra = dctn(signals, axes=axes, norm="ortho")
+    power = gaussian_filter(spectra**2, (0, *(2 for _ in axes)), mode="nearest")
+    gain = 1 - np.minimum(1.5 * noise_variance / np.where(power > 0, power, 1), 1)
+    return idctn(spectra * gain, axes=axes, norm="ortho")
+
+
+def levelled(images: NDArray) -> NDArray:
+    """Subtract from each image the plane that fits it best.
+
+    The product of a template without tilt with a window does not depend on a gradient of the window's
+    background, so that uneven illumination moves neither x and y nor z.
+
+    Parameters
+    ----------
+    images : array (..., n, n)
+
+    Returns
+    -------
+    array (..., n, n)
+    """
+    n = images.shape[-1]
+    ramp = (np.arange(n) - (n - 1) / 2).astype(images.dtype)
+    unit = ramp / (n * (ramp**2).sum())
+    down, across = (np.einsum(f"...ij,{axis}->...", images, unit)[..., None, None] for axis in "ij")
+    return images - images.mean(axis=(-2, -1), keepdims=True) - down * ramp[:, None] - across * ramp
+
+
+def displacement_solvers(templates: NDArray, z_um: NDArray) -> NDArray[np.float32]:
+    """What turns a window into a particle's brightness and small displacement.
+
+    For each template T the first four rows of the pseudo-inverse of [T, dT/dy, dT/dx, dT/dz, 1, y, x]: their
+    products with a window that shows a T, moved by (dy, dx, dz), are the least-squares a, -a dy, -a dx (px)
+    and a dz (µm), whatever the level and slope of the background.
+
+    Parameters
+    ----------
+    templates : array (N, n, n)
+    z_um : array (N,)
+
+    Returns
+    -------
+    float32 array (N, 4, n * n)
+    """
+    count, n, _ = templates.shape
+    slopes = np.gradient(templates, np.arange(n), np.arange(n), z_um, axis=(1, 2, 0))
+    background = (np.broadcast_to(b, templates.shape) for b in (np.ones((n, n)), *np.indices((n, n)) - n // 2))
+    columns = [c.reshape(count, -1) for c in (templates, *slopes, *background)]
+    return np.linalg.pinv(np.stack(columns, axis=2))[:, :4].astype(np.float32)
 
 
 def noise_level(images: NDArray) -> float:

@@ -7,7 +7,8 @@
 4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, which is blind
    to the noise that lowers the whole profile; a parabola through the best three gives the part of a step.
 5. Refinement: the candidate's window is correlated with stack images from the guess onward, uphill along z
-   until C_m no longer rises; then parabolas through neighbouring positions and depths.
+   until C_m no longer rises. Between pixels and images, x, y and z are the least-squares displacement of the
+   best image within that window.
 6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
 
 A particle is measured only if its whole window lies in the frame; nothing is said of a border half a
@@ -28,12 +29,8 @@ from tqdm.auto import tqdm
 from gdptlab.calibration import Calibration
 from gdptlab.check import positive, real_array, whole
 
-
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""
-
-CROSS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
-"""A pixel and its four neighbours, (row, column)."""
 
 
 def locate(
@@ -88,10 +85,15 @@ def locate(
         raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
     distance = size / 4 if min_distance_px is None else positive("min_distance_px", min_distance_px, zero=True)
     image = image - image.mean(dtype=np.float64).astype(np.float32)
-    found = _candidates(image, calibration, threshold)
-    x, y, step, cm = _refined(image, calibration, *found[:3]) if refine else found
-    kept = _strongest(x, y, np.where(cm >= threshold, cm, 0), distance)
-    x, y, step, cm = (values[kept] for values in (x, y, step, cm))
+    place, best, step, cm = _candidates(image, calibration, threshold)
+    if refine:
+        place, step, cm = _refined(image, calibration, place, step)
+    else:
+        first = _pixels(image, calibration, place)
+        shift = _displacements(_windows(image, first, size), calibration.solvers[best])
+        place = first + size // 2 + np.clip(shift[:, :2], -1, 1)
+    kept = _strongest(place, np.where(cm >= threshold, cm, 0), distance)
+    (y, x), step, cm = place[kept].T, step[kept], cm[kept]
     last = len(calibration) - 1
     return pd.DataFrame(
         {
@@ -107,7 +109,7 @@ def locate(
 def _candidates(
     image: NDArray[np.float32], calibration: Calibration, threshold: float
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Peaks of the correlation maps: x, y (px), z (steps of the stack), C_m, each (n,)."""
+    """Peaks of the correlation maps: place (y, x) (n, 2), best template of the stack, z in steps of it, C_m."""
     scale, near = (2, 1) if calibration.half_resolution else (1, 2)
     searched = cv2.pyrDown(image) if scale == 2 else image
     maps = calibration.correlator(searched.shape)(searched)
@@ -119,64 +121,66 @@ def _candidates(
     around = np.arange(-near, near + 1)
     patches = maps[:, row[:, None, None] + around[:, None], column[:, None, None] + around]
     profile = patches.max(axis=(2, 3)).T
-    best = profile.argmax(axis=1)
 
     likeness = _standardised(profile) @ _standardised(calibration.expected).T
     k = np.clip(likeness.argmax(axis=1), 1, len(calibration) - 2)
-    step = k + _vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])[0]
+    step = k + _vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
 
-    cross = maps[best[:, None], row[:, None] + CROSS[:, 0], column[:, None] + CROSS[:, 1]]
-    y = row + _vertex(cross[:, [1, 0, 2]])[0]
-    x = column + _vertex(cross[:, [3, 0, 4]])[0]
+    best = profile.argmax(axis=1)
+    up_down = np.stack([maps[best, row + i, column] for i in (-1, 0, 1)], axis=1)
+    left_right = np.stack([maps[best, row, column + i] for i in (-1, 0, 1)], axis=1)
     middle = calibration.search_templates.shape[-1] // 2
-    return scale * (x + middle), scale * (y + middle), step, profile[np.arange(len(row)), best]
+    place = scale * (np.stack([row + _vertex(up_down), column + _vertex(left_right)], axis=1) + middle)
+    return place, calibration.subset[best], step, profile[np.arange(len(row)), best]
+
+
+def _pixels(image: NDArray[np.float32], calibration: Calibration, place: NDArray) -> NDArray[np.int64]:
+    """First pixels (n, 2) of the windows around `place` (n, 2), the nearest that lie in the image."""
+    first = np.rint(place - calibration.size // 2).astype(int)
+    return np.clip(first, 0, np.array(image.shape) - calibration.size)
+
+
+def _windows(image: NDArray[np.float32], place: NDArray, size: int) -> NDArray[np.float32]:
+    """Windows that start at `place` (n, 2), flat and with mean 0, (n, size * size)."""
+    seen = sliding_window_view(image, (size, size))[place[:, 0], place[:, 1]].reshape(len(place), size * size)
+    return seen - seen.mean(axis=1, keepdims=True)
+
+
+def _displacements(windows: NDArray, solvers: NDArray) -> NDArray:
+    """Least-squares displacement (dy px, dx px, dz µm) in each window, (n, 3); 0 where nothing is bright."""
+    a, *products = np.matmul(solvers, windows[:, :, None])[..., 0].T
+    return (products / np.where(a > 0, a, np.inf)).T * (-1, -1, 1)
 
 
 def _refined(
-    image: NDArray[np.float32], calibration: Calibration, x: NDArray, y: NDArray, step: NDArray
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Walk every candidate uphill, along the stack and to neighbouring pixels, to its best C_m (0: none)."""
+    image: NDArray[np.float32], calibration: Calibration, place: NDArray, step: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Walk every candidate along the stack and across the pixels to its best C_m (0 if it leaves the frame)."""
     half, last = calibration.size // 2, len(calibration) - 1
-    windows = sliding_window_view(image, (calibration.size, calibration.size))
     templates = calibration.templates.reshape(last + 1, -1)
-    low, high = 1, np.array(windows.shape[:2]) - 2
-    place = np.clip(np.rint(np.stack([y, x], axis=1) - half).astype(int), low, high)
-    step = _uphill(_correlations(windows, place, templates), np.clip(np.rint(step).astype(int), 0, last))
-    scores = np.zeros((len(place), len(CROSS), 3), dtype=np.float32)
-    walking = np.arange(len(place))
+    first = _pixels(image, calibration, place)
+    step = np.clip(np.rint(step).astype(int), 0, last)
+    cm, shift = np.zeros(len(first)), np.zeros((len(first), 3))
+    walking = np.arange(len(first))
     for _ in range(half):  # who walks farther than half a template follows no particle
-        depths = np.clip(step[walking, None] + (-1, 0, 1), 0, last)
-        near = place[walking, None] + CROSS
-        now = _correlations(windows, near, templates[depths])
-        scores[walking] = now
-        flat = now.reshape(len(now), -1)
-        better = np.flatnonzero(flat.max(axis=1) > now[:, 0, 1])
-        to, k = np.unravel_index(flat[better].argmax(axis=1), now.shape[1:])
-        walking = walking[better]
-        place[walking], step[walking] = near[better, to], depths[better, k]
-        leaves = ((place[walking] < low) | (place[walking] > high)).any(axis=1)
-        scores[walking[leaves]] = 0
+        seen = _windows(image, first[walking], calibration.size)
+        norm = np.linalg.norm(seen, axis=1, keepdims=True)
+        scores = seen @ templates.T / np.where(norm > 0, norm, np.inf)
+        step[walking] = k = _uphill(scores, step[walking])
+        cm[walking] = scores[np.arange(len(k)), k]
+        shift[walking] = _displacements(seen, calibration.solvers[k])
+        # Not at half a pixel already, or those half-way would go to and fro.
+        move = np.where(np.abs(shift[walking, :2]) > 0.6, np.sign(shift[walking, :2]), 0).astype(int)
+        walking, move = walking[move.any(axis=1)], move[move.any(axis=1)]
+        first[walking] += move
+        leaves = ((first[walking] < 0) | (first[walking] > np.array(image.shape) - calibration.size)).any(axis=1)
+        cm[walking[leaves]] = 0
         walking = walking[~leaves]
         if not len(walking):
             break
-    down, up_by = _vertex(scores[:, [1, 0, 2]].swapaxes(1, 2))
-    across, over_by = _vertex(scores[:, [3, 0, 4]].swapaxes(1, 2))
-    along, rise = _vertex(scores[:, 0] + up_by + over_by)
+    part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[step], -0.5, 0.5)
     inner = (step > 0) & (step < last)
-    return (
-        place[:, 1] + half + across[:, 1],
-        place[:, 0] + half + down[:, 1],
-        step + np.where(inner, along, 0),
-        scores[:, 0, 1] + up_by[:, 1] + over_by[:, 1] + np.where(inner, rise, 0),
-    )
-
-
-def _correlations(windows: NDArray, place: NDArray, templates: NDArray) -> NDArray[np.float32]:
-    """Correlate the windows at places (n, ..., 2) with templates (k, pixels) or (n, k, pixels)."""
-    images = windows[place[..., 0], place[..., 1]].reshape(*place.shape[:-1], -1)
-    squares = np.einsum("...p,...p->...", images, images) - images.sum(axis=-1) ** 2 / images.shape[-1]
-    norm = np.sqrt(np.where(squares > 0, squares, np.inf))
-    return images @ templates.swapaxes(-1, -2) / norm[..., None]
+    return first + half + np.clip(shift[:, :2], -1, 1), step + np.where(inner, part, 0), cm
 
 
 def _uphill(scores: NDArray, step: NDArray) -> NDArray:
@@ -191,16 +195,12 @@ def _uphill(scores: NDArray, step: NDArray) -> NDArray:
     return step
 
 
-def _vertex(values: NDArray) -> tuple[NDArray, NDArray]:
-    """Parabola through three values, (..., 3), at -1, 0, 1: place of its top, and how far that is above the middle.
-
-    Where the middle is not the highest the top is taken to be at the nearest end of (-1/2, 1/2).
-    """
-    before, here, after = np.moveaxis(values, -1, 0)
+def _vertex(values: NDArray) -> NDArray:
+    """Top, within (-1/2, 1/2), of the parabola through three values (n, 3) at -1, 0 and 1."""
+    before, here, after = values.T
     bend = before + after - 2 * here
     slope = (after - before) / 2
-    place = np.clip(np.divide(-slope, bend, out=np.sign(slope) / 2, where=bend < 0), -0.5, 0.5)
-    return place, place * slope + place**2 * bend / 2
+    return np.clip(np.divide(-slope, bend, out=np.sign(slope) / 2, where=bend < 0), -0.5, 0.5)
 
 
 def _standardised(profiles: NDArray) -> NDArray:
@@ -210,10 +210,9 @@ def _standardised(profiles: NDArray) -> NDArray:
     return centred / np.where(norm > 0, norm, 1)
 
 
-def _strongest(x: NDArray, y: NDArray, cm: NDArray, distance: float) -> NDArray[np.int64]:
+def _strongest(place: NDArray, cm: NDArray, distance: float) -> NDArray[np.int64]:
     """Indices by falling C_m, without those nearer than `distance` to a stronger one, or with none."""
-    points = np.column_stack([x, y])
-    near = KDTree(points).query_ball_point(points, distance) if len(points) else []
+    near = KDTree(place).query_ball_point(place, distance) if len(place) else []
     taken = cm <= 0
     kept = []
     for i in np.argsort(-cm, kind="stable"):

@@ -108,9 +108,7 @@ class Microscope:
     def _face_radius_um(self) -> float:
         return 2 * self.focal_length_um * (self.n_lens / self.n_medium - 1)
 
-    def trace(
-        self, z_um: float, points: NDArray, diameter_um: float | None = None
-    ) -> tuple[NDArray, NDArray, NDArray]:
+    def trace(self, z_um: float, points: NDArray, diameter_um: float | None = None) -> tuple[NDArray, NDArray, NDArray]:
         """Follow rays from a sphere on the optical axis to the sensor.
 
         Parameters
