@@ -113,7 +113,7 @@ def scores_by_z(
         As in `match`.
     edges_um : array (n + 1,)
         Increasing edges of the bins of z. True and matched particles are counted by their true depth, those
-        measured by their measured one.
+        measured by their measured one; so are the matched in `precision`, which never exceeds 1.
 
     Returns
     -------
@@ -124,12 +124,16 @@ def scores_by_z(
     if len(edges) < 2 or (np.diff(edges) <= 0).any():
         raise ValueError(f"edges_um: got {edges}, allowed are two or more increasing numbers")
     pairs = match(measured, true, within_px=within_px, within_um=within_um)
-    parts = [pd.cut(t["z_um"], edges, labels=False, include_lowest=True) for t in (pairs, true, measured)]
+    found = measured.loc[pairs["measured"]]
+    parts = [pd.cut(t["z_um"], edges, labels=False, include_lowest=True) for t in (pairs, true, measured, found)]
     rows = [
         _summary(pairs[parts[0] == k], int((parts[1] == k).sum()), int((parts[2] == k).sum()))
         for k in range(len(edges) - 1)
     ]
-    return pd.DataFrame(rows).assign(z_um=(edges[1:] + edges[:-1]) / 2).set_index("z_um").reset_index()
+    table = pd.DataFrame(rows).assign(z_um=(edges[1:] + edges[:-1]) / 2).set_index("z_um").reset_index()
+    right = np.array([(parts[3] == k).sum() for k in range(len(edges) - 1)])
+    table["precision"] = right / table["n_measured"]  # NaN if there are none
+    return table
 
 
 def _summary(pairs: pd.DataFrame, n_true: int, n_measured: int) -> pd.Series:

@@ -7,6 +7,7 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 import os
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import Self
 
@@ -20,7 +21,7 @@ from scipy.ndimage import shift as shift_image
 from skimage.registration import phase_cross_correlation
 
 from gdptlab.check import positive, real_array, whole
-from gdptlab.correlation import Correlator, normalised
+from gdptlab.correlation import Correlator, normalised, on_one_core
 from gdptlab.files import written_whole
 
 VERSION = 1
@@ -53,6 +54,7 @@ class Calibration:
     _plans: dict = field(default_factory=dict, repr=False)
 
     @classmethod
+    @on_one_core
     def from_stack(
         cls,
         stack: ArrayLike,
@@ -85,17 +87,13 @@ class Calibration:
             If the stack or z_um are not of that form, hold NaN, or an image is constant; if n or n_sub is out
             of range.
         """
-        stack = real_array("stack", stack, 3)
-        z_um = np.asarray(real_array("z_um", z_um, 1), dtype=np.float64)
+        stack, z_um = real_array("stack", stack, 3), _depths(z_um)
         if stack.shape[1] != stack.shape[2] or stack.shape[1] % 2 == 0:
             raise ValueError(f"stack: got images of {stack.shape[1:]} px, allowed are square ones of odd size")
         if len(stack) < 3:
             raise ValueError(f"stack: got {len(stack)} images, allowed are 3 or more")
         if len(z_um) != len(stack):
             raise ValueError(f"z_um: got {len(z_um)} depths, needed is one for each of {len(stack)} images")
-        steps = np.diff(z_um)
-        if not ((steps > 0).all() or (steps < 0).all()):
-            raise ValueError("z_um: got depths that turn or repeat, allowed are strictly increasing or decreasing")
         constant = np.flatnonzero(np.ptp(stack, axis=(1, 2)) == 0)
         if len(constant):
             raise ValueError(f"stack: got constant images at {constant.tolist()}, allowed are images with contrast")
@@ -103,10 +101,11 @@ class Calibration:
         n_sub = whole("n_sub", n_sub, 2, n)
         order = np.argsort(z_um)[np.rint(np.linspace(0, len(stack) - 1, n)).astype(int)]
         stack, z_um = stack[order], z_um[order]
-        subset = ((np.arange(n_sub) + 0.5) * n / n_sub).astype(np.int64)
+        subset = ((np.arange(n_sub) + 0.5) * (n - 1) / n_sub + 0.5).astype(np.int64)  # to the nearest
         return cls(stack, z_um, subset, normalised(levelled(denoised(stack) if denoise else stack)))
 
     @classmethod
+    @on_one_core
     def from_scan(
         cls,
         scan: ArrayLike,
@@ -142,29 +141,30 @@ class Calibration:
         TypeError, ValueError
             As `from_stack`; also if the particle is nearer to the border than half a template.
         """
-        scan = real_array("scan", scan, 3)
-        z_um = np.asarray(real_array("z_um", z_um, 1), dtype=np.float64)
+        scan, z_um = real_array("scan", scan, 3), _depths(z_um)
         if len(z_um) != len(scan):
             raise ValueError(f"z_um: got {len(z_um)} depths, needed is one for each of {len(scan)} frames")
         rows, columns = scan.shape[1:]
         x_px, y_px = positive("x_px", x_px, zero=True), positive("y_px", y_px, zero=True)
         room = int(min(x_px, y_px, columns - 1 - x_px, rows - 1 - y_px)) - 2
-        if size is None:
-            size = _image_size(_cut(scan, x_px, y_px, max(room, 1)))
+        where = f"a particle at x_px = {x_px:g}, y_px = {y_px:g} in frames of {columns} by {rows} px"
+        if room < 1:
+            raise ValueError(f"x_px, y_px: got {where}, allowed is one 3 px or more inside")
         largest = 2 * room + 1
+        if size is None:
+            size = _image_size(_cut(scan, x_px, y_px, room))
+        if not isinstance(size, Integral) or isinstance(size, bool):
+            raise TypeError(f"size: got {size!r}, allowed are odd whole numbers")
         if not 3 <= size <= largest or size % 2 == 0:
-            raise ValueError(
-                f"size: got {size} px, allowed are odd sizes from 3 to {largest} "
-                f"for a particle at x_px = {x_px:g}, y_px = {y_px:g} in frames of {columns} by {rows} px"
-            )
+            raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {largest} for {where}")
         centres = _centres(scan, z_um, x_px, y_px, size)
-        half = size // 2
-        stack = []
-        for frame, (x, y) in zip(scan, centres, strict=True):
-            moved = shift_image(frame, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
-            top, left = round(y_px) - half, round(x_px) - half
-            stack.append(moved[top : top + size, left : left + size])
-        return cls.from_stack(np.stack(stack), z_um, n_sub=n_sub, n=n, denoise=denoise)
+        margin = min(room + 2 - size // 2, 16)  # for the spline, and for a particle that drifts
+        stack = [
+            shift_image(image, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
+            for image, (x, y) in zip(_cut(scan, x_px, y_px, size // 2 + margin), centres, strict=True)
+        ]
+        stack = np.stack(stack)[:, margin:-margin, margin:-margin]
+        return cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
 
     def __len__(self) -> int:
         return len(self.stack)
@@ -255,7 +255,7 @@ class Calibration:
             If it is damaged, of another version, or no calibration.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
                 data = {name: file[name] for name in file.files}
         except FileNotFoundError:
             raise
@@ -264,10 +264,22 @@ class Calibration:
                 f"path: got {Path(path).name!r}, which cannot be read as a calibration: {error}"
             ) from error
         version = data.pop("gdptlab_calibration", None)
-        if version is None or version != VERSION or set(data) != {"stack", "z_um", "subset", "templates"}:
-            name = Path(path).name
+        name = Path(path).name
+        if not np.array_equal(version, VERSION) or set(data) != {"stack", "z_um", "subset", "templates"}:
             raise ValueError(f"path: got {name!r} of version {version}, allowed are calibrations of version {VERSION}")
+        if not len(data["stack"]) == len(data["z_um"]) == len(data["templates"]) > data["subset"].max():
+            raise ValueError(f"path: got {name!r}, whose parts do not fit each other")
         return cls(**data)
+
+
+def _depths(z_um: ArrayLike) -> NDArray[np.float64]:
+    """Check depths, which need more digits than images have."""
+    real_array("z_um", z_um, 1)
+    z_um = np.array(z_um, dtype=np.float64)
+    steps = np.diff(z_um)
+    if not ((steps > 0).all() or (steps < 0).all()):
+        raise ValueError("z_um: got depths that turn or repeat, allowed are strictly increasing or decreasing")
+    return z_um
 
 
 def denoised(stack: NDArray) -> NDArray[np.float32]:
@@ -384,7 +396,7 @@ def _cut(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
     return scan[:, y - half : y + half + 1, x - half : x + half + 1]
 
 
-def _image_size(cut: NDArray, faint: float = 0.08) -> int:
+def _image_size(cut: NDArray, faint: float = 0.1) -> int:
     """Smallest odd size that holds the particle in every slice of (N, 2 r + 1, 2 r + 1).
 
     An image ends where the mean over a ring about the centre first falls below the share `faint` of the
@@ -402,7 +414,7 @@ def _image_size(cut: NDArray, faint: float = 0.08) -> int:
         brightest = int(profile.argmax())
         faint_from = np.flatnonzero(profile[brightest:] < faint * profile[brightest])
         reach = max(reach, brightest + int(faint_from[0]) if len(faint_from) else half)
-    return 2 * min(reach + 1, half) + 1
+    return 2 * min(reach, half) + 1
 
 
 def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) -> NDArray[np.float64]:

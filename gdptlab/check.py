@@ -9,6 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+def number(name: str, value: Any) -> float:
+    """Return `value` as a float if it is a finite number.
+
+    Raises
+    ------
+    TypeError
+        If `value` is not a real number.
+    ValueError
+        If it is not finite.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"{name}: got {value!r}, allowed is a finite number")
+    if not math.isfinite(value):
+        raise ValueError(f"{name}: got {value!r}, allowed is a finite number")
+    return float(value)
+
+
 def positive(name: str, value: Any, *, zero: bool = False) -> float:
     """Return `value` as a float if it is a finite number above zero (or zero, if allowed).
 

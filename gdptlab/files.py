@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -85,15 +86,31 @@ def read_images(path: str | os.PathLike[str]) -> NDArray:
     """
     name = Path(path).name
     try:
-        # Kept quiet: tifffile reports a cut-off file in its log and returns what is left.
-        with tifffile.TiffFile(path) as file:
+        with _errors_raised(tifffile.logger()), tifffile.TiffFile(path) as file:
             pages = len(file.pages)
+            sizes = {page.shape for page in file.pages}
             images = file.asarray(key=range(pages))
     except FileNotFoundError:
         raise
     except Exception as error:  # of many kinds, for files that are no TIFF or are damaged
         raise ValueError(f"path: got {name!r}, which cannot be read as a TIFF: {error}") from error
     images = images[None] if images.ndim == 2 else images
-    if images.ndim != 3 or len(images) != pages:
+    if images.ndim != 3 or len(images) != pages or len(sizes) > 1:
         raise ValueError(f"path: got {name!r} of shape {images.shape}, allowed are grey images of one size")
     return images
+
+
+@contextmanager
+def _errors_raised(logger: logging.Logger) -> Iterator[None]:
+    """Raise what is logged as an error: tifffile only logs that a file is cut off, and returns what is left."""
+
+    class Raising(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            raise ValueError(record.getMessage())
+
+    handler = Raising(logging.ERROR)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)

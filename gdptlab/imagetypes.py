@@ -78,7 +78,7 @@ def disturbed(
     rows, columns = light.shape
     along_x = np.sin(2 * np.pi * np.arange(columns) / positive("period_px[0]", period_px[0]) + phase_rad[0])
     along_y = np.sin(2 * np.pi * np.arange(rows) / positive("period_px[1]", period_px[1]) + phase_rad[1])
-    return brightfield(light, white) + amplitude * np.outer(along_y, along_x).astype(light.dtype)
+    return brightfield(light, white) + amplitude * np.outer(along_y, along_x).astype(np.result_type(light, np.float32))
 
 
 IMAGE_TYPES: dict[str, Callable[[NDArray], NDArray]] = {

@@ -28,11 +28,16 @@ from tqdm.auto import tqdm
 
 from gdptlab.calibration import Calibration
 from gdptlab.check import positive, real_array, whole
+from gdptlab.correlation import on_one_core
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""
 
+ROUNDS = 8
+"""Of the refinement's walk, at most. A particle needs one or two."""
 
+
+@on_one_core
 def locate(
     image: ArrayLike,
     calibration: Calibration,
@@ -161,9 +166,10 @@ def _refined(
     first = _pixels(image, calibration, place)
     step = np.clip(np.rint(step).astype(int), 0, last)
     cm, shift = np.zeros(len(first)), np.zeros((len(first), 3))
-    walking = np.arange(len(first))
-    for _ in range(half):  # who walks farther than half a template follows no particle
-        seen = _windows(image, first[walking], calibration.size)
+    walking, there = np.arange(len(first)), first.copy()
+    for _ in range(ROUNDS):
+        first[walking] = there
+        seen = _windows(image, there, calibration.size)
         norm = np.linalg.norm(seen, axis=1, keepdims=True)
         scores = seen @ templates.T / np.where(norm > 0, norm, np.inf)
         step[walking] = k = _uphill(scores, step[walking])
@@ -171,11 +177,11 @@ def _refined(
         shift[walking] = _displacements(seen, calibration.solvers[k])
         # Not at half a pixel already, or those half-way would go to and fro.
         move = np.where(np.abs(shift[walking, :2]) > 0.6, np.sign(shift[walking, :2]), 0).astype(int)
-        walking, move = walking[move.any(axis=1)], move[move.any(axis=1)]
-        first[walking] += move
-        leaves = ((first[walking] < 0) | (first[walking] > np.array(image.shape) - calibration.size)).any(axis=1)
+        there = there + move
+        leaves = ((there < 0) | (there > np.array(image.shape) - calibration.size)).any(axis=1)
         cm[walking[leaves]] = 0
-        walking = walking[~leaves]
+        on = move.any(axis=1) & ~leaves
+        walking, there = walking[on], there[on]
         if not len(walking):
             break
     part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[step], -0.5, 0.5)

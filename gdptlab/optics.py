@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_lsq_spline
 from scipy.stats import qmc
 
-from gdptlab.check import positive, whole
+from gdptlab.check import number, positive, whole
 from gdptlab.files import cache_folder, written_whole
 from gdptlab.imagetypes import Camera, as_image_type
 
@@ -82,9 +82,10 @@ class Microscope:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "focus_um" or (field.name == "cylinder_um" and value is None):
-                continue
-            positive(field.name, value)
+            if field.name == "focus_um":
+                number(field.name, value)
+            elif field.name != "cylinder_um" or value is not None:
+                positive(field.name, value)
         if not self.na < 1:
             raise ValueError(f"na: got {self.na}, allowed is a number between 0 and 1 (a lens in air)")
         if not self.n_lens > self.n_medium:
@@ -282,6 +283,8 @@ class Microscope:
         -------
         uint16 array (N, size, size)
         """
+        if whole("size", size, 1, 2**20) % 2 == 0:
+            raise ValueError(f"size: got {size}, allowed are odd numbers")
         rng = None if rng is None else np.random.default_rng(rng)
         middle = (size - 1) / 2
         return np.stack(
@@ -344,7 +347,8 @@ def _fine_offset(position: float) -> tuple[int, int, float]:
     """Split a position into whole pixel, fine pixel in it, and the share of the next fine pixel."""
     whole_px = int(np.floor(position))
     fine = (position - whole_px) * OVERSAMPLING
-    return whole_px, int(fine), fine - int(fine)
+    k = min(int(fine), OVERSAMPLING - 1)  # a hair below a whole number, fine is rounded up to OVERSAMPLING
+    return whole_px, k, fine - k
 
 
 def _trimmed(fine: NDArray, kept: float = 0.9999) -> NDArray:

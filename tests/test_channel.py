@@ -53,9 +53,7 @@ def test_flow_speeds_of_the_paper():
 @pytest.mark.parametrize(("width", "height"), [(3000, 30), (30, 3000)])
 def test_flow_between_far_walls_is_a_parabola(width, height):
     channel = Channel(width_um=width, height_um=height)
-    assert channel.max_speed_um_s == pytest.approx(
-        1.5 * channel.mean_speed_um_s / (1 - 0.6302 / 100), rel=1e-5
-    )
+    assert channel.max_speed_um_s == pytest.approx(1.5 * channel.mean_speed_um_s / (1 - 0.6302 / 100), rel=1e-5)
 
 
 @pytest.mark.parametrize("channel", [Channel(), ODD.channel, Channel(width_um=30, height_um=3000)])

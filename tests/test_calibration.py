@@ -1,0 +1,500 @@
+"""Calibration: what it keeps of a stack, its map, centring in a scan, denoising, files, bad input."""
+
+import pickle
+import zipfile
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import CALIBRATION_SEED, IMAGE_TYPES, SIZE_PX, Z_UM, table
+
+from gdptlab import Calibration, locate
+from gdptlab.calibration import VERSION, denoised, displacement_solvers, levelled, noise_level
+from gdptlab.correlation import correlate_plainly, normalised
+
+DENOISED_BY = 4  # times smaller 1 - NCC of the worst image against the noise-free stack, at least
+CENTRE_PX = 0.1  # mean error of x and y with a calibration cut out of a scan
+CENTRE_Z_UM = 1.0  # likewise of z
+
+
+def distance(images, clean):
+    """1 - NCC of each image with its noise-free one."""
+    return 1 - np.einsum("kij,kij->k", normalised(images), normalised(clean.astype(float)))
+
+
+# -------------------- from a stack
+
+
+@pytest.mark.parametrize(
+    ("n", "n_sub", "expected"),
+    [
+        (51, 9, [4, 9, 15, 20, 26, 32, 37, 43, 48]),
+        (51, 51, range(1, 52)),
+        (51, 1 + 49, range(2, 52)),
+        (51, 2, [14, 39]),
+        (11, 3, [3, 6, 9]),
+        (11, 5, [2, 4, 6, 8, 10]),
+        (3, 2, [2, 3]),
+    ],
+)
+def test_subset_is_the_middle_of_equal_bins(clean_stack, n, n_sub, expected):
+    subset = Calibration.from_stack(clean_stack[:n], Z_UM[:n], n_sub=n_sub, denoise=False).subset
+    assert (subset + 1).tolist() == list(expected)
+
+
+def test_attributes(stacks):
+    made = Calibration.from_stack(stacks["disturbed"], Z_UM)
+    assert len(made) == 51 and made.size == 61
+    np.testing.assert_array_equal(made.stack, stacks["disturbed"])
+    np.testing.assert_array_equal(made.z_um, Z_UM)
+    assert made.stack.dtype == made.templates.dtype == np.float32 and made.z_um.dtype == np.float64
+    np.testing.assert_allclose(made.templates.mean(axis=(1, 2)), 0, atol=1e-6)
+    np.testing.assert_allclose((made.templates**2).sum(axis=(1, 2)), 1, rtol=1e-5)
+    assert np.corrcoef(made.templates[10].ravel(), levelled(made.stack)[10].ravel())[0, 1] > 0.99
+
+
+def test_depths_keep_their_digits(clean_stack):
+    z_um = 12_345.678 + 0.0001 * np.arange(5)
+    np.testing.assert_array_equal(Calibration.from_stack(clean_stack[:5], z_um, n_sub=2).z_um, z_um)
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.float64, ">u2"])
+def test_any_real_type(stacks, dtype):
+    stack = stacks["fluorescent"][::5]
+    expected = Calibration.from_stack(stack, Z_UM[::5])
+    made = Calibration.from_stack(np.asfortranarray(stack.astype(dtype)), list(Z_UM[::5]))
+    np.testing.assert_array_equal(made.templates, expected.templates)
+
+
+def test_stack_is_not_changed(stacks):
+    stack = stacks["fluorescent"][::5].astype(np.float32)
+    kept = stack.copy()
+    stack.flags.writeable = False
+    Calibration.from_stack(stack, Z_UM[::5])
+    np.testing.assert_array_equal(stack, kept)
+
+
+def test_falling_depths_are_the_same_stack_reversed(stacks):
+    rising = Calibration.from_stack(stacks["fluorescent"], Z_UM)
+    falling = Calibration.from_stack(stacks["fluorescent"][::-1], Z_UM[::-1])
+    for name in ("stack", "z_um", "subset", "templates"):
+        np.testing.assert_array_equal(getattr(falling, name), getattr(rising, name))
+
+
+@pytest.mark.parametrize(
+    ("n", "kept"), [(51, range(51)), (11, range(0, 51, 5)), (6, range(0, 51, 10)), (3, (0, 25, 50))]
+)
+def test_n_keeps_images_evenly_spread(stacks, n, kept):
+    made = Calibration.from_stack(stacks["fluorescent"], Z_UM, n=n, n_sub=3)
+    np.testing.assert_array_equal(made.z_um, Z_UM[list(kept)])
+    np.testing.assert_array_equal(made.stack, stacks["fluorescent"][list(kept)])
+    direct = Calibration.from_stack(stacks["fluorescent"][list(kept)], Z_UM[list(kept)], n_sub=3)
+    np.testing.assert_array_equal(made.templates, direct.templates)
+
+
+# -------------------- denoising
+
+
+@pytest.mark.parametrize("seed", [71, 72, 73])
+@pytest.mark.parametrize("n", [51, 11, 6])
+def test_denoising_brings_images_nearer_to_noise_free_ones(microscope, clean_stack, n, seed):
+    keep = np.rint(np.linspace(0, 50, n)).astype(int)
+    noisy = microscope.stack(Z_UM[keep], SIZE_PX, rng=seed).astype(np.float32)
+    before, after = distance(noisy, clean_stack[keep]), distance(denoised(noisy), clean_stack[keep])
+    assert (after < before).all()
+    assert after.max() < before.max() / DENOISED_BY
+    assert after.mean() < before.mean() / DENOISED_BY
+
+
+def test_denoising_leaves_a_clean_stack_as_it_is(clean_stack):
+    assert distance(denoised(clean_stack.astype(np.float32)), clean_stack).max() < 2e-4
+
+
+def test_denoising_keeps_levels(stacks):
+    for kind in IMAGE_TYPES:
+        stack = stacks[kind].astype(np.float32)
+        np.testing.assert_allclose(denoised(stack).mean(axis=(1, 2)), stack.mean(axis=(1, 2)), atol=0.1)
+
+
+def test_denoise_can_be_left_out(stacks):
+    raw = Calibration.from_stack(stacks["fluorescent"], Z_UM, denoise=False)
+    np.testing.assert_allclose(raw.templates, normalised(levelled(raw.stack)), atol=1e-7)
+
+
+@pytest.mark.parametrize("sigma", [3.0, 38.0])
+def test_noise_level(clean_stack, sigma):
+    noise = np.random.default_rng(1).normal(0, sigma, clean_stack.shape)
+    assert noise_level(noise) == pytest.approx(sigma, rel=0.02)
+    assert noise_level(noise[0]) == pytest.approx(sigma, rel=0.1)
+    assert noise_level(clean_stack + noise) == pytest.approx(sigma, rel=0.3 if sigma < 10 else 0.05)
+
+
+def test_levelled_takes_out_any_plane():
+    images = np.random.default_rng(2).normal(size=(3, 9, 9))
+    y, x = np.indices((9, 9))
+    level = levelled(images)
+    np.testing.assert_allclose(levelled(images + 5 + 0.3 * x - 2 * y), level, atol=1e-12)
+    for basis in (np.ones((9, 9)), x, y):
+        np.testing.assert_allclose((level * basis).sum(axis=(1, 2)), 0, atol=1e-10)
+
+
+@pytest.mark.parametrize(("dx", "dy", "dz"), [(0.3, 0, 0), (0, -0.2, 0), (0, 0, 0.4), (0.1, 0.15, -0.3)])
+def test_solvers_read_a_displacement(microscope, clean_stack, dx, dy, dz):
+    solvers = displacement_solvers(normalised(levelled(clean_stack.astype(np.float32))), Z_UM)
+    y, x = np.indices((SIZE_PX, SIZE_PX))
+    for k in (5, 17, 33, 45):
+        moved = microscope.light(table(30 + dx, 30 + dy, Z_UM[k] + dz), (SIZE_PX, SIZE_PX))
+        a, *products = solvers[k] @ (moved + 40 - 0.7 * x + 1.1 * y).ravel()
+        np.testing.assert_allclose(products / a * np.array((-1, -1, 1)), (dy, dx, dz), atol=0.2)
+
+
+# -------------------- the map and quality figures
+
+
+def test_map_is_the_correlation_of_stack_with_subset(calibrations):
+    for made in calibrations.values():
+        assert made.expected.shape == (51, 9)
+        plain = correlate_plainly(made.stack[20], made.templates[made.subset])[:, 0, 0]
+        others = made.subset != 20
+        # Searched for at half resolution, with planes taken out: near, not the same.
+        np.testing.assert_allclose(made.expected[20, others], plain[others], atol=0.06)
+
+
+def test_map_of_plain_images_is_plain(clean_stack):
+    """Without half resolution and for level images, entries off the diagonal are the definition."""
+    stack = levelled(clean_stack[::5].astype(np.float32))
+    made = Calibration.from_stack(stack, Z_UM[::5], n_sub=3, denoise=False)
+    if made.half_resolution:
+        made.__dict__["half_resolution"] = False
+    plain = np.stack([correlate_plainly(image, stack[made.subset])[:, 0, 0] for image in stack])
+    off = np.arange(11)[:, None] != made.subset
+    np.testing.assert_allclose(made.expected[off], plain[off], atol=5e-5)
+
+
+def test_diagonal_is_the_parabola_of_its_neighbours(calibration):
+    for column, k in enumerate(calibration.subset):
+        profile, near = calibration.expected[:, column], [k - 2, k - 1, k + 1, k + 2]
+        here = np.polyval(np.polyfit(Z_UM[near], profile[near], 2), Z_UM[k])
+        assert profile[k] == pytest.approx(min(here, 1), abs=1e-4)
+
+
+def test_diagonal_has_no_spike(calibration, stacks):
+    """An image that meets itself, noise and all, is not in the map: entries keep below 1 where noise is high."""
+    raw = Calibration.from_stack(stacks["fluorescent"], Z_UM, denoise=False)
+    k, column = raw.subset[-1], len(raw.subset) - 1
+    assert raw.expected[k, column] - raw.expected[[k - 1, k + 1], column].mean() < 0.02
+    assert raw.expected[k, column] < 0.95
+    assert raw.expected.max() <= 1
+
+
+def test_expected_profile_peaks_at_its_depth(calibration):
+    peaks = calibration.expected.argmax(axis=0)
+    assert (np.abs(peaks - calibration.subset) <= 3).all()  # dim noisy ones least sharply
+
+
+def test_self_similarity(calibration):
+    likeness = calibration.self_similarity()
+    assert likeness.shape == (51, 51)
+    np.testing.assert_allclose(likeness, likeness.T, atol=1e-6)
+    np.testing.assert_allclose(np.diag(likeness), 1, atol=1e-5)
+    k, m = 12, 30
+    plain = correlate_plainly(calibration.templates[k], calibration.templates[m][None])[0, 0, 0]
+    assert likeness[k, m] == pytest.approx(plain, abs=1e-5)
+
+
+def test_signal_to_noise(calibration, clean_stack):
+    expected = np.ptp(clean_stack.astype(float), axis=(1, 2)) / 38
+    assert calibration.signal_to_noise().shape == (51,)
+    np.testing.assert_allclose(calibration.signal_to_noise(), expected, rtol=0.15)
+
+
+def test_signal_to_noise_is_that_of_the_contrast(calibrations):
+    """Dark particles on a bright field have the contrast of bright ones on a dark field."""
+    bright, dark = (calibrations[k].signal_to_noise() for k in ("fluorescent", "brightfield"))
+    np.testing.assert_allclose(dark, bright, rtol=0.2)
+
+
+# -------------------- from a scan of full frames
+
+
+SCAN_Z_UM = Z_UM[::2]
+
+
+@pytest.fixture(scope="module", params=["fluorescent", "brightfield"])
+def scan(request, microscope):
+    """Image type, frames of a bead at (66.37, 51.58) that drifts by (0.9, -0.6) px, another far away; a calibration."""
+    rng = np.random.default_rng(CALIBRATION_SEED + 5)
+    x, y = np.linspace(66.37, 67.27, 26), np.linspace(51.58, 50.98, 26)
+    frames = [
+        microscope.render(table([x[k], 158], [y[k], 50], [z, z]), (104, 170), image_type=request.param, rng=rng)
+        for k, z in enumerate(SCAN_Z_UM)
+    ]
+    frames = np.stack(frames)
+    return request.param, frames, Calibration.from_scan(frames, SCAN_Z_UM, 68, 50, size=61)  # off by (-1.2, 1.3) px
+
+
+def measured_errors(microscope, made, kind, seed=91):
+    """Errors of 60 particles at random sub-pixel places."""
+    rng = np.random.default_rng(seed)
+    errors = []
+    for _ in range(10):
+        x, y = np.array([a.ravel() for a in np.meshgrid([50, 140, 230], [50, 140])]) + rng.uniform(-4, 4, (2, 6))
+        true = table(x, y, rng.uniform(-45, 45, 6))
+        found = locate(microscope.render(true, (190, 280), image_type=kind, rng=rng), made)
+        order = [np.hypot(found["x_px"] - p.x_px, found["y_px"] - p.y_px).argmin() for p in true.itertuples()]
+        errors.append(found.iloc[order][["x_px", "y_px", "z_um"]].to_numpy() - true.to_numpy())
+    return np.concatenate(errors)
+
+
+def test_scan_is_centred(microscope, scan):
+    kind, _, made = scan
+    assert made.size == 61
+    bias = measured_errors(microscope, made, kind).mean(axis=0)
+    assert (np.abs(bias) < (CENTRE_PX, CENTRE_PX, CENTRE_Z_UM)).all(), bias
+
+
+def test_scan_drift_is_followed(scan, clean_stack):
+    """Every slice shows the particle in the middle: it resembles the stack rendered there, and not one shifted."""
+    kind, _, made = scan
+    clean_stack = clean_stack[::2]
+    clean = normalised(clean_stack.astype(float)) * (1 if kind == "fluorescent" else -1)
+    right = np.einsum("kij,kij->k", made.templates, clean)
+    for axis in (1, 2):
+        for shift in (-1, 1):
+            assert (right > np.einsum("kij,kij->k", made.templates, np.roll(clean, shift, axis))).all()
+    assert right.min() > 0.97
+
+
+def test_size_is_found_by_itself(scan, clean_stack):
+    _, frames, _ = scan
+    made = Calibration.from_scan(frames, SCAN_Z_UM, 67, 51)
+    assert made.size % 2 == 1
+    assert 55 <= made.size <= 69
+    cut = (61 - min(made.size, 61)) // 2
+    light = clean_stack - 500.0
+    inside = light[:, cut : 61 - cut, cut : 61 - cut].sum(axis=(1, 2))
+    assert (inside / light.sum(axis=(1, 2))).min() > 0.9
+
+
+def test_scan_falling_is_rising(scan):
+    _, frames, _ = scan
+    rising = Calibration.from_scan(frames, SCAN_Z_UM, 67, 51, size=41, n=11, n_sub=4)
+    falling = Calibration.from_scan(frames[::-1], SCAN_Z_UM[::-1], 67, 51, size=41, n=11, n_sub=4)
+    np.testing.assert_allclose(falling.stack, rising.stack, rtol=1e-4)
+    assert len(rising) == 11 and len(rising.subset) == 4
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "size", "largest"),
+    [(25, 51, 61, 47), (67, 25, 61, 47), (150, 51, 61, 35), (67, 80, 61, 43), (67, 51, 62, 99), (67, 51, 1, 99)],
+)
+def test_scan_refuses_a_particle_at_the_border(scan, x, y, size, largest):
+    message = (
+        f"^size: got {size} px, allowed are odd sizes from 3 to {largest} for a particle at x_px = {x}, y_px = {y}"
+    )
+    with pytest.raises(ValueError, match=message):
+        Calibration.from_scan(scan[1], Z_UM, x, y, size=size)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0, 0), (169, 103), (400, 50), (50, 400), (1, 50)])
+def test_scan_refuses_a_particle_on_the_border(scan, x, y):
+    with pytest.raises(ValueError, match=f"^x_px, y_px: got a particle at x_px = {x}, y_px = {y} in frames of 170"):
+        Calibration.from_scan(scan[1], Z_UM, x, y)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"x_px": np.nan}, ValueError, "^x_px: got nan"),
+        ({"y_px": -3}, ValueError, "^y_px: got -3, allowed is a finite number, at least 0"),
+        ({"x_px": "97"}, TypeError, "^x_px: got '97'"),
+        ({"z_um": SCAN_Z_UM[:-1]}, ValueError, "^z_um: got 25 depths, needed is one for each of 26 frames"),
+        ({"z_um": np.full(26, 3.0)}, ValueError, "^z_um: got depths that turn or repeat"),
+        ({"scan": np.zeros((60, 60))}, ValueError, r"^scan: got shape \(60, 60\), allowed are 3 axes"),
+        ({"size": 41.0}, TypeError, "^size: got 41.0, allowed are"),
+        ({"size": "41"}, TypeError, "^size: got '41', allowed are"),
+        ({"n_sub": 52}, ValueError, "^n_sub: got 52, allowed are whole numbers from 2 to 26"),
+        ({"n": 2}, ValueError, "^n: got 2, allowed are whole numbers from 3 to 26"),
+        ({"sizes": 41}, TypeError, "sizes"),
+    ],
+)
+def test_scan_refuses(scan, changes, error, message):
+    with pytest.raises(error, match=message):
+        Calibration.from_scan(**({"scan": scan[1], "z_um": SCAN_Z_UM, "x_px": 67, "y_px": 51, "size": 21} | changes))
+
+
+# -------------------- files
+
+
+def test_saved_and_loaded_is_the_same_to_the_bit(calibration, tmp_path):
+    calibration.save(tmp_path / "a.npz")
+    loaded = Calibration.load(str(tmp_path / "a.npz"))
+    for name in ("stack", "z_um", "subset", "templates", "expected"):
+        one, other = getattr(loaded, name), getattr(calibration, name)
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_saved_under_another_suffix_is_refused(calibration, tmp_path):
+    with pytest.raises(ValueError, match="^path: got 'a.npy', allowed are names that end in .npz"):
+        calibration.save(tmp_path / "a.npy")
+    assert not list(tmp_path.iterdir())
+
+
+def test_saving_leaves_the_old_file_or_none_when_it_fails(calibration, tmp_path, monkeypatch):
+    def full_disk(path, **_):
+        path.write_bytes(b"half")
+        raise OSError("no space left")
+
+    (tmp_path / "old.npz").write_bytes(b"old")
+    monkeypatch.setattr(np, "savez_compressed", full_disk)
+    for name in ("old.npz", "new.npz"):
+        with pytest.raises(OSError, match="no space left"):
+            calibration.save(tmp_path / name)
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"old"]
+
+
+def arrays(made) -> dict:
+    return {"stack": made.stack, "z_um": made.z_um, "subset": made.subset, "templates": made.templates}
+
+
+@pytest.mark.parametrize("version", [None, 0, VERSION + 1, "1", [1, 1]])
+def test_other_versions_are_refused(calibration, tmp_path, version):
+    extra = {} if version is None else {"gdptlab_calibration": version}
+    np.savez(tmp_path / "a.npz", **arrays(calibration), **extra)
+    with pytest.raises(ValueError, match=r"^path: got 'a.npz' of version .*, allowed are calibrations of version 1"):
+        Calibration.load(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("missing", ["stack", "z_um", "subset", "templates"])
+def test_missing_parts_are_refused(calibration, tmp_path, missing):
+    parts = arrays(calibration)
+    del parts[missing]
+    np.savez(tmp_path / "a.npz", gdptlab_calibration=VERSION, **parts)
+    with pytest.raises(ValueError, match="^path: got 'a.npz'"):
+        Calibration.load(tmp_path / "a.npz")
+
+
+def test_parts_that_do_not_fit_are_refused(calibration, tmp_path):
+    for name in ("stack", "z_um", "templates"):
+        parts = arrays(calibration) | {name: arrays(calibration)[name][:-1]}
+        np.savez(tmp_path / "a.npz", gdptlab_calibration=VERSION, **parts)
+        with pytest.raises(ValueError, match="^path: got 'a.npz'"):
+            Calibration.load(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"no archive", b"\x93NUMPY"])
+def test_other_files_are_refused(tmp_path, content):
+    (tmp_path / "a.npz").write_bytes(content)
+    with pytest.raises(ValueError, match="^path: got 'a.npz', which cannot be read as a calibration"):
+        Calibration.load(tmp_path / "a.npz")
+
+
+def test_a_single_array_is_refused(calibration, tmp_path):
+    np.save(tmp_path / "a.npy", calibration.stack)
+    with pytest.raises(ValueError, match="^path: got 'a.npy', which cannot be read as a calibration"):
+        Calibration.load(tmp_path / "a.npy")
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        Calibration.load(tmp_path / "absent.npz")
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.95, 0.999])
+def test_truncated_files_are_refused(calibration, tmp_path, share):
+    path = tmp_path / "a.npz"
+    calibration.save(path)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(ValueError, match="^path: got 'a.npz', which cannot be read as a calibration"):
+        Calibration.load(path)
+
+
+def test_flipped_bytes_are_refused(calibration, tmp_path):
+    path = tmp_path / "a.npz"
+    calibration.save(path)
+    for name in ("stack.npy", "templates.npy"):
+        with zipfile.ZipFile(path) as archive:
+            info = archive.getinfo(name)
+        content = bytearray(path.read_bytes())
+        content[info.header_offset + 100 + info.compress_size // 2] ^= 0xFF
+        damaged = tmp_path / "damaged.npz"
+        damaged.write_bytes(content)
+        with pytest.raises(ValueError, match="^path: got 'damaged.npz', which cannot be read as a calibration"):
+            Calibration.load(damaged)
+
+
+class Bomb:
+    """Unpickling it makes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (open, (str(self.path), "w"))
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_pickles_are_refused_and_never_opened(calibration, tmp_path, inside):
+    path, trace = tmp_path / "a.npz", tmp_path / "exploded"
+    if inside:
+        bombs = np.empty(1, dtype=object)
+        bombs[0] = Bomb(trace)
+        np.savez(path, gdptlab_calibration=VERSION, **(arrays(calibration) | {"subset": bombs}))
+    else:
+        path.write_bytes(pickle.dumps(Bomb(trace)))
+    with pytest.raises(ValueError, match="^path: got 'a.npz', which cannot be read as a calibration"):
+        Calibration.load(path)
+    assert not trace.exists()
+
+
+# -------------------- bad input
+
+STACK = np.random.default_rng(0).random((6, 9, 9))
+NAN, INF, FLAT = (STACK.copy() for _ in range(3))
+NAN[2, 3, 4], INF[2, 3, 4], FLAT[[1, 4]] = np.nan, np.inf, 7
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"stack": STACK[:, :8, :8]}, ValueError, r"^stack: got images of \(8, 8\) px, allowed are square ones of odd"),
+        ({"stack": STACK[:, :7]}, ValueError, r"^stack: got images of \(7, 9\) px"),
+        ({"stack": STACK[0]}, ValueError, r"^stack: got shape \(9, 9\), allowed are 3 axes"),
+        ({"stack": STACK[:2], "z_um": [0, 1]}, ValueError, "^stack: got 2 images, allowed are 3 or more"),
+        ({"stack": STACK[:0], "z_um": []}, ValueError, r"^stack: got shape \(0, 9, 9\)"),
+        ({"stack": NAN}, ValueError, "^stack: got NaN or infinity, allowed are finite"),
+        ({"stack": INF}, ValueError, "^stack: got NaN or infinity"),
+        ({"stack": FLAT}, ValueError, r"^stack: got constant images at \[1, 4\], allowed are images with contrast"),
+        ({"stack": STACK * 1j}, TypeError, "^stack: got values of type complex128, allowed are real numbers"),
+        ({"stack": STACK.astype(str)}, TypeError, "^stack: got values of type <U"),
+        ({"z_um": range(5)}, ValueError, "^z_um: got 5 depths, needed is one for each of 6 images"),
+        ({"z_um": [0, 1, 2, 2, 3, 4]}, ValueError, "^z_um: got depths that turn or repeat, allowed are strictly incr"),
+        ({"z_um": [0, 1, 2, 3, 2, 4]}, ValueError, "^z_um: got depths that turn or repeat"),
+        ({"z_um": [0, 1, 2, 3, 4, np.nan]}, ValueError, "^z_um: got NaN or infinity"),
+        ({"z_um": [range(6)]}, ValueError, r"^z_um: got shape \(1, 6\), allowed are 1 axes"),
+        ({"z_um": list("abcdef")}, TypeError, "^z_um: got values of type <U1"),
+        ({"n_sub": 1}, ValueError, "^n_sub: got 1, allowed are whole numbers from 2 to 6"),
+        ({"n_sub": 7}, ValueError, "^n_sub: got 7, allowed are whole numbers from 2 to 6"),
+        ({"n_sub": 5, "n": 4}, ValueError, "^n_sub: got 5, allowed are whole numbers from 2 to 4"),
+        ({"n_sub": 3.0}, TypeError, "^n_sub: got 3.0, allowed are whole numbers"),
+        ({"n": 2}, ValueError, "^n: got 2, allowed are whole numbers from 3 to 6"),
+        ({"n": 7}, ValueError, "^n: got 7"),
+        ({"nsub": 3}, TypeError, "nsub"),
+    ],
+)
+def test_stack_refuses(changes, error, message):
+    with pytest.raises(error, match=message):
+        Calibration.from_stack(**({"stack": STACK, "z_um": range(6), "n_sub": 3} | changes))
+
+
+def test_three_slices_are_enough(clean_stack):
+    made = Calibration.from_stack(clean_stack[::25], Z_UM[::25], n_sub=2)
+    assert np.isfinite(made.expected).all()
+    assert len(locate(np.pad(clean_stack[25], 40, mode="edge"), made)) == 1
+
+
+def test_a_calibration_cannot_be_changed(calibration):
+    with pytest.raises(AttributeError):
+        calibration.z_um = pd.Series(Z_UM)

@@ -1,0 +1,468 @@
+"""From frame to table: accuracy on isolated particles, borders, invariances, batches, bad input.
+
+Accuracy is held against the project's budgets, with noise in the calibration images and in the frames; seeds
+are those of conftest.
+"""
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import IMAGE_TYPES, SIZE_PX, Z_UM, on_grid, table
+
+from gdptlab import Calibration, batch, locate, match
+from gdptlab.assess import scores
+from gdptlab.locate import COLUMNS
+
+# Isolated particles, the dimmest with a peak of ten times the read noise.
+RECALL, PRECISION = 0.99, 0.97
+SIGMA_XY_PX = {True: 0.05, False: 0.07}  # with and without refinement; 0.06 measured without
+SIGMA_Z_UM = {True: 0.6, False: 2.0}
+# Mean errors that do not average out: noise of the calibration images, and of the method.
+BIAS_XY_PX = 0.06
+BIAS_Z_UM = {True: 1.0, False: 1.5}
+PIXEL_LOCKING_PX = 0.02
+# No noise anywhere.
+CLEAN_XY_PX, CLEAN_Z_UM = 0.03, 0.4
+# Random positions, 50 in 512 by 512 px, for particles whose window lies in the frame.
+CROWDED_RECALL, CROWDED_PRECISION = 0.65, 0.8
+
+
+# -------------------- accuracy
+
+
+@pytest.fixture(scope="module", params=[(k, r) for k in IMAGE_TYPES for r in (True, False)], ids=str)
+def measurement(request, isolated, calibrations):
+    """Whether refined, measured and true particles, for each image type with and without refinement."""
+    kind, refine = request.param
+    frames, true = isolated[kind]
+    return refine, batch(frames, calibrations[kind], refine=refine, progress=False), true
+
+
+def test_isolated_particles_are_found_and_measured(measurement):
+    refine, measured, true = measurement
+    found = scores(measured, true)
+    print(found.round(4).to_dict())
+    assert found["n_true"] >= 500
+    assert found["recall"] >= RECALL
+    assert found["precision"] >= PRECISION
+    assert found["sigma_x_px"] <= SIGMA_XY_PX[refine]
+    assert found["sigma_y_px"] <= SIGMA_XY_PX[refine]
+    assert found["sigma_z_um"] <= SIGMA_Z_UM[refine]
+
+
+def assert_no_bias(errors, bins, budget):
+    """Mean of `errors` in each bin is within four standard errors and the budget."""
+    for _, part in errors.groupby(bins):
+        assert len(part) >= 20
+        assert abs(part.mean()) <= 4 * part.std() / np.sqrt(len(part)) + budget
+
+
+def test_no_bias_at_any_depth(measurement):
+    refine, measured, true = measurement
+    pairs = match(measured, true)
+    depth = (pairs["z_um"] // 20).clip(-3, 2)
+    assert_no_bias(pairs["dx_px"], depth, BIAS_XY_PX)
+    assert_no_bias(pairs["dy_px"], depth, BIAS_XY_PX)
+    assert_no_bias(pairs["dz_um"], depth, BIAS_Z_UM[refine])
+
+
+def test_no_pixel_locking(measurement):
+    _, measured, true = measurement
+    pairs = match(measured, true)
+    for name in ("x_px", "y_px"):
+        offset = true.loc[pairs["true"], name].to_numpy() % 2  # whether searched for at half resolution or not
+        assert_no_bias(pairs[f"d{name}"], (4 * offset).astype(int), PIXEL_LOCKING_PX)
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_without_noise(microscope, clean_stack, refine):
+    made = Calibration.from_stack(clean_stack, Z_UM)
+    rng = np.random.default_rng(81)
+    true = pd.concat([on_grid(rng).assign(frame=k) for k in range(4)], ignore_index=True)
+    measured = batch((microscope.render(t, (512, 700)) for _, t in true.groupby("frame")), made, progress=False)
+    found = scores(measured, true)
+    assert found["recall"] == found["precision"] == 1
+    assert max(found["sigma_x_px"], found["sigma_y_px"]) <= CLEAN_XY_PX
+    assert found["sigma_z_um"] <= CLEAN_Z_UM
+
+
+def test_refinement_and_cm(measurement):
+    """C_m of isolated particles is high, at most 1, and highest first in each frame."""
+    _, measured, _ = measurement
+    assert measured["cm"].between(0.5, 1).all()
+    assert measured["cm"].median() > 0.9
+    assert (measured.groupby("frame")["cm"].diff().dropna() <= 0).all()
+
+
+def test_denoising_matters(stacks, isolated, calibrations):
+    """With the raw images as templates, z is pulled towards the sharp, bright ones."""
+    raw = Calibration.from_stack(stacks["fluorescent"], Z_UM, denoise=False)
+    frames, true = isolated["fluorescent"]
+    sigmas = [scores(batch(frames, c, progress=False), true)["sigma_z_um"] for c in (raw, calibrations["fluorescent"])]
+    assert sigmas[1] < 0.6 * sigmas[0]
+
+
+def test_profile_is_read_around_the_peak(isolated, calibrations):
+    """What the module says of the neighbourhood: at the peak's pixel alone the profile is farther from the expected."""
+    made = calibrations["fluorescent"]
+    frames, true = isolated["fluorescent"]
+    likeness = {0: [], 1: []}  # reach in pixels of the maps
+    for number, frame in enumerate(frames[:4]):
+        image = frame.astype(np.float32)
+        image = cv2.pyrDown(image) if made.half_resolution else image
+        maps = made.correlator(image.shape)(image)
+        scale, half = image.shape[0] / frame.shape[0], made.search_templates.shape[-1] // 2
+        for p in true[true["frame"] == number].itertuples():
+            row, column = (round(scale * v) - half for v in (p.y_px, p.x_px))
+            near = maps.max(axis=0)[row - 2 : row + 3, column - 2 : column + 3]
+            i, j = np.unravel_index(near.argmax(), near.shape)
+            row, column = row - 2 + i, column - 2 + j
+            expected = made.expected[np.abs(made.z_um - p.z_um).argmin()]
+            for reach, values in likeness.items():
+                patch = maps[:, row - reach : row + reach + 1, column - reach : column + reach + 1]
+                values.append(np.corrcoef(patch.max(axis=(1, 2)), expected)[0, 1])
+    off = {reach: 1 - np.mean(values) for reach, values in likeness.items()}
+    print(off)
+    assert off[1] < off[0]
+
+
+def test_random_positions(microscope, calibration):
+    """The paper's method among overlapping particles, over twelve frames."""
+    rng = np.random.default_rng(83)
+    results = []
+    for _ in range(12):
+        true = table(rng.uniform(0, 511, 50), rng.uniform(0, 511, 50), rng.uniform(-50, 50, 50))
+        measured = locate(microscope.render(true, rng=rng), calibration)
+        half = SIZE_PX // 2
+        inside = true[["x_px", "y_px"]].apply(lambda v: v.between(half, 511 - half)).all(axis=1)
+        pairs = match(measured, true)
+        results.append((len(set(pairs["true"]) & set(true.index[inside])) / inside.sum(), len(pairs) / len(measured)))
+    recall, precision = np.array(results).T
+    print(f"recall {recall.mean():.2f} ± {recall.std():.2f}, precision {precision.mean():.2f} ± {precision.std():.2f}")
+    assert recall.mean() >= CROWDED_RECALL
+    assert precision.mean() >= CROWDED_PRECISION
+
+
+# -------------------- borders
+
+
+@pytest.mark.parametrize("refine", [True, False])
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
+def test_near_the_border_measured_well_or_absent(microscope, calibration, side, refine):
+    rows, columns, half = 150, 190, SIZE_PX // 2
+    rng = np.random.default_rng(85)
+    errors = []
+    for gap in np.arange(12, 40, 0.83):
+        x, y = {"left": (gap, 70), "right": (columns - 1 - gap, 70), "top": (95, gap), "bottom": (95, rows - 1 - gap)}[
+            side
+        ]
+        true = table(x, y + rng.uniform(0, 1) * (side in ("left", "right")), rng.uniform(-45, 45))
+        measured = locate(microscope.render(true, (rows, columns), rng=rng), calibration, refine=refine)
+        assert len(measured) <= 1
+        if gap >= half + 3:
+            assert len(measured) == 1
+        if gap < half - 1:
+            assert len(measured) == 0
+        if len(measured):
+            errors.append((measured[["x_px", "y_px", "z_um"]] - true).to_numpy()[0])
+    assert (np.abs(errors) < (0.4, 0.4, 4)).all()
+    assert (np.abs(np.mean(errors, axis=0)) < (0.1, 0.1, 1.0)).all()
+
+
+def test_a_frame_as_large_as_a_template_is_measured_or_empty(microscope, calibration):
+    frame = microscope.render(table(30, 30, -20), (61, 61), rng=1)
+    measured = locate(frame, calibration)
+    assert len(measured) <= 1  # its peak lies on the rim of the one-pixel map
+    assert_columns(measured)
+
+
+# -------------------- what must not matter, and what must
+
+
+def assert_same(one, other, xy_px=2e-3, z_um=2e-2, cm=1e-4):
+    assert len(one) == len(other) > 0
+    for names, tolerance in ((["x_px", "y_px"], xy_px), (["z_um"], z_um), (["cm"], cm)):
+        np.testing.assert_allclose(one[names], other[names], rtol=0, atol=tolerance)
+    pd.testing.assert_series_equal(one["at_end"], other["at_end"])
+
+
+def assert_columns(measured, extra=()):
+    assert measured.dtypes.astype(str).to_dict() == dict(extra) | {
+        "x_px": "float64",
+        "y_px": "float64",
+        "z_um": "float64",
+        "cm": "float64",
+        "at_end": "bool",
+    }
+    assert list(measured) == [*dict(extra), *COLUMNS]
+
+
+def test_few_particles_are_where_they_are(few, calibration):
+    frame, true = few
+    measured = locate(frame, calibration)
+    pairs = match(measured, true, within_px=0.3, within_um=2)
+    assert len(pairs) == len(measured) == 4
+    assert_columns(measured)
+    assert measured.index.tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("refine", [True, False])
+@pytest.mark.parametrize(("gain", "level"), [(1, 5000), (1, -700), (3, 0), (0.01, 0), (1e4, 1e6)])
+def test_gain_and_level_do_not_matter(few, calibration, gain, level, refine):
+    frame, _ = few
+    expected = locate(frame, calibration, refine=refine)
+    assert_same(locate(gain * frame.astype(float) + level, calibration, refine=refine), expected)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int64, np.float32, np.float64, ">u2"])
+def test_type_does_not_matter(few, calibration, dtype):
+    frame = np.minimum(few[0] // 16, 255)
+    expected = locate(frame, calibration)
+    pd.testing.assert_frame_equal(locate(frame.astype(dtype), calibration), expected, check_exact=True)
+
+
+@pytest.mark.parametrize("kind", ["read-only", "Fortran order", "negative strides", "every second", "list"])
+def test_memory_layout_does_not_matter(few, calibration, kind):
+    frame, _ = few
+    given = {
+        "read-only": frame.copy(),
+        "Fortran order": np.asfortranarray(frame),
+        "negative strides": frame[::-1, ::-1].copy()[::-1, ::-1],
+        "every second": np.repeat(np.repeat(frame, 2, axis=0), 2, axis=1)[::2, ::2],
+        "list": frame.tolist(),
+    }[kind]
+    if kind == "read-only":
+        given.flags.writeable = False
+    pd.testing.assert_frame_equal(locate(given, calibration), locate(frame, calibration), check_exact=True)
+
+
+def test_image_is_not_changed(few, calibration):
+    frame = few[0].astype(np.float32)
+    kept = frame.copy()
+    locate(frame, calibration)
+    np.testing.assert_array_equal(frame, kept)
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_transposed_images_swap_x_and_y(few, stacks, calibration, refine):
+    turned = Calibration.from_stack(stacks["fluorescent"].transpose(0, 2, 1), Z_UM)
+    expected = locate(few[0], calibration, refine=refine)
+    measured = locate(few[0].T, turned, refine=refine).rename(columns={"x_px": "y_px", "y_px": "x_px"})
+    assert_same(measured, expected)
+
+
+def test_transposed_frame_alone_is_another_depth(few, calibration):
+    """Astigmatism: with x and y swapped, a particle of one focus looks like none of its depth."""
+    frame, true = few
+    swapped = true.rename(columns={"x_px": "y_px", "y_px": "x_px"})
+    assert len(match(locate(frame.T, calibration), swapped, within_um=5)) < 2
+
+
+def test_mirrored_frames(few, calibration):
+    """Particle images are symmetric about both axes, so a mirrored frame has mirrored positions."""
+    frame, _ = few
+    expected = locate(frame, calibration)
+    for flip, name, last in ((np.fliplr, "x_px", 229), (np.flipud, "y_px", 169)):
+        mirrored = locate(flip(frame), calibration)
+        mirrored[name] = last - mirrored[name]
+        assert_same(mirrored, expected, xy_px=0.1, z_um=0.8, cm=0.01)
+
+
+def test_moved_frames(few, calibration):
+    """A frame cut two pixels later (the search is at half resolution) has everything two pixels earlier."""
+    expected = locate(few[0], calibration)
+    moved = locate(few[0][2:, 4:], calibration)
+    assert_same(moved.assign(x_px=moved["x_px"] + 4, y_px=moved["y_px"] + 2), expected)
+
+
+def test_same_input_same_table(few, calibration):
+    one, other = locate(few[0], calibration), locate(few[0], calibration)
+    pd.testing.assert_frame_equal(one, other, check_exact=True)
+
+
+def test_a_plan_for_one_shape_does_not_spoil_another(microscope, calibration, few):
+    expected = locate(few[0], calibration)
+    locate(microscope.render(table(50, 60, 0), (99, 130)), calibration)
+    pd.testing.assert_frame_equal(locate(few[0], calibration), expected, check_exact=True)
+
+
+def test_ends_of_the_stack_are_flagged(microscope, calibration):
+    true = table([50, 150, 250, 350], 60, [-54.5, -10.0, 20.0, 54.5])
+    measured = locate(microscope.render(true, (120, 400), rng=5), calibration).sort_values("x_px")
+    assert measured["at_end"].tolist() == [True, False, False, True]
+    assert measured["z_um"].iloc[[0, 3]].tolist() == [-50, 50]
+
+
+def test_threshold_is_a_lowest_cm(few, calibration):
+    full = locate(few[0], calibration, threshold=0.5)
+    strict = full["cm"].sort_values().iloc[1] + 1e-6
+    pd.testing.assert_frame_equal(locate(few[0], calibration, threshold=strict), full[full["cm"] >= strict])
+    assert len(locate(few[0], calibration, threshold=1)) == 0
+
+
+def test_min_distance(microscope, calibration):
+    frame = microscope.render(table([60, 81], [60, 60], [-25, -25]), (120, 160), rng=2)
+    assert len(locate(frame, calibration)) == 2
+    assert len(locate(frame, calibration, min_distance_px=25)) == 1
+
+
+def test_evenly_lit_background_does_not_matter(few, calibration):
+    """A plane of light over the frame moves nothing."""
+    y, x = np.indices(few[0].shape)
+    tilted = few[0] + 0.9 * x - 0.6 * y
+    assert_same(locate(tilted, calibration), locate(few[0], calibration), xy_px=0.03, z_um=0.3, cm=0.05)
+
+
+def test_an_inverted_frame_holds_none(few, calibration):
+    """Inverted images correlate to -1: each kind of image needs its own calibration."""
+    assert len(match(locate(20_000 - few[0].astype(float), calibration), few[1])) == 0
+
+
+@pytest.mark.parametrize("refine", [True, False])
+@pytest.mark.parametrize("image", [np.zeros((70, 90)), np.full((70, 90), 4321.7), np.ones((61, 61), np.uint16)])
+def test_constant_image_gives_an_empty_table(calibration, image, refine):
+    measured = locate(image, calibration, refine=refine)
+    assert len(measured) == 0
+    assert_columns(measured)
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_noise_alone_holds_no_particle(microscope, calibration, refine):
+    measured = locate(microscope.render(table([], [], []), (200, 300), rng=9), calibration, refine=refine)
+    assert len(measured) == 0
+    assert_columns(measured)
+
+
+# -------------------- batches
+
+
+def test_batch_is_locate_on_each_frame(isolated, calibration):
+    frames = isolated["fluorescent"][0][:3]
+    measured = batch(frames, calibration, progress=False)
+    assert_columns(measured, {"frame": "int64"})
+    for number, frame in enumerate(frames):
+        part = measured[measured["frame"] == number].drop(columns="frame").reset_index(drop=True)
+        pd.testing.assert_frame_equal(part, locate(frame, calibration), check_exact=True)
+    assert measured.index.tolist() == list(range(len(measured)))
+
+
+def test_batch_takes_any_iterable(few, calibration):
+    frames = [few[0], few[0][:, :150], few[0]]
+    expected = batch(frames, calibration, progress=False)
+    assert expected.groupby("frame").size()[0] == expected.groupby("frame").size()[2] == 4
+    pd.testing.assert_frame_equal(batch((f for f in frames), calibration, progress=False), expected)
+    stack = np.stack([few[0], few[0]])
+    pd.testing.assert_frame_equal(batch(stack, calibration, progress=False), batch(list(stack), calibration))
+
+
+def test_batch_reads_frames_one_by_one(few, calibration, monkeypatch):
+    """No frame is drawn long before it is needed."""
+    done = []
+    module = __import__("sys").modules["gdptlab.locate"]
+
+    def spy(*args, **kwargs):
+        done.append(1)
+        return locate(*args, **kwargs)
+
+    def film():
+        for k in range(4):
+            assert len(done) >= k - 1
+            yield few[0]
+
+    monkeypatch.setattr(module, "locate", spy)
+    batch(film(), calibration, progress=False)
+    assert len(done) == 4
+
+
+def test_batch_with_frames_without_particles(few, calibration):
+    blank = np.zeros((100, 120))
+    measured = batch([blank, few[0], blank], calibration, progress=False)
+    assert (measured["frame"] == 1).all() and len(measured) == 4
+    assert_columns(measured, {"frame": "int64"})
+    assert_columns(batch([blank], calibration, progress=False), {"frame": "int64"})
+
+
+@pytest.mark.parametrize("frames", [[], iter(()), np.zeros((0, 100, 100))])
+def test_batch_of_no_frames(calibration, frames):
+    measured = batch(frames, calibration, progress=False)
+    assert len(measured) == 0
+    assert_columns(measured, {"frame": "int64"})
+
+
+def test_batch_passes_settings_on(few, calibration):
+    measured = batch([few[0]], calibration, progress=False, refine=False, threshold=0.9)
+    pd.testing.assert_frame_equal(
+        measured.drop(columns="frame"), locate(few[0], calibration, refine=False, threshold=0.9)
+    )
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_number_of_processes_does_not_matter(isolated, calibration, refine):
+    frames = isolated["fluorescent"][0][:4]
+    one, two = (batch(frames, calibration, n_jobs=n, refine=refine, progress=False) for n in (1, 2))
+    pd.testing.assert_frame_equal(one, two, check_exact=True)
+
+
+def test_progress(few, calibration, capsys):
+    batch([few[0]], calibration)
+    assert "1/1" in capsys.readouterr().err
+    batch([few[0]], calibration, progress=False)
+    assert capsys.readouterr() == ("", "")
+
+
+# -------------------- bad input
+
+
+def with_value(value):
+    image = np.random.default_rng(0).random((80, 90))
+    image[11, 22] = value
+    return image
+
+
+@pytest.mark.parametrize(
+    ("image", "error", "message"),
+    [
+        (np.zeros(90), ValueError, r"^image: got shape \(90,\), allowed are 2 axes, none of them empty"),
+        (np.zeros((80, 90, 3)), ValueError, r"^image: got shape \(80, 90, 3\)"),
+        (np.zeros((0, 90)), ValueError, r"^image: got shape \(0, 90\)"),
+        (np.zeros((60, 90)), ValueError, r"^image: got shape \(60, 90\), allowed is no smaller than a template, \(61"),
+        (np.zeros((90, 60)), ValueError, r"^image: got shape \(90, 60\)"),
+        (with_value(np.nan), ValueError, "^image: got NaN or infinity, allowed are finite numbers"),
+        (with_value(np.inf), ValueError, "^image: got NaN or infinity"),
+        (with_value(1).astype(complex), TypeError, "^image: got values of type complex128, allowed are real numbers"),
+        (np.full((80, 90), "a"), TypeError, "^image: got values of type <U1"),
+        (None, TypeError, "^image: got values of type object"),
+    ],
+)
+def test_bad_images(calibration, image, error, message):
+    with pytest.raises(error, match=message):
+        locate(image, calibration)
+    with pytest.raises(error, match=message):
+        batch([with_value(0), image], calibration, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"threshold": 0}, ValueError, "^threshold: got 0, allowed is a"),
+        ({"threshold": -0.5}, ValueError, "^threshold: got -0.5"),
+        ({"threshold": 1.01}, ValueError, "^threshold: got 1.01, allowed is above 0 and at most 1"),
+        ({"threshold": np.nan}, ValueError, "^threshold: got nan"),
+        ({"threshold": "0.5"}, TypeError, "^threshold: got '0.5'"),
+        ({"min_distance_px": -1}, ValueError, "^min_distance_px: got -1, allowed is a finite number, at least 0"),
+        ({"min_distance_px": np.inf}, ValueError, "^min_distance_px: got inf"),
+        ({"treshold": 0.5}, TypeError, "treshold"),
+    ],
+)
+def test_bad_settings(calibration, settings, error, message):
+    with pytest.raises(error, match=message):
+        locate(with_value(0), calibration, **settings)
+    with pytest.raises(error, match=message):
+        batch([with_value(0)], calibration, progress=False, **settings)
+
+
+@pytest.mark.parametrize(("n_jobs", "error"), [(0, ValueError), (-2, ValueError), (1.5, TypeError)])
+def test_bad_number_of_processes(calibration, n_jobs, error):
+    with pytest.raises(error, match=f"^n_jobs: got {n_jobs}, allowed are whole numbers from 1"):
+        batch([with_value(0)], calibration, n_jobs=n_jobs)
