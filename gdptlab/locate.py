@@ -2,8 +2,8 @@
 
 1. The frame is correlated with the N_sub images of the calibration's subset (Figure 2b).
 2. Candidates are local peaks, in any of the maps, above a threshold.
-3. A candidate's profile is the highest C_m in each map within two pixels of the peak (Figure 2c). The
-   neighbourhood matters: maps of sharp templates have narrow peaks that a pixel's offset would miss.
+3. A candidate's profile is the highest C_m in each map within two pixels of the peak (Figure 2c). Peaks of
+   different maps may lie a pixel apart; reading the profile at one pixel gives z as well, to a few per cent.
 4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, which is blind
    to the noise that lowers the whole profile; a parabola through the best three gives the part of a step.
 5. Refinement: the candidate's window is correlated with stack images from the guess onward, uphill along z

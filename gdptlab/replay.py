@@ -70,13 +70,18 @@ class Method:
         Raises
         ------
         TypeError, ValueError
-            If the evaluator returns no table, or one without a column that is needed.
+            If the evaluator returns no table, one without a column that is needed, or one that holds anything
+            but numbers.
         """
         table = self.evaluator(image, self.calibration, **self.settings)
         if not isinstance(table, pd.DataFrame):
             raise TypeError(f"evaluator: got a {type(table).__name__} from it, allowed is a DataFrame")
         if not {"x_px", "y_px", "z_um"} <= set(table):
             raise ValueError(f"evaluator: got columns {list(table)} from it, needed are x_px, y_px and z_um")
+        if len(table) == 0:
+            return table.astype({name: float for name, dtype in table.dtypes.items() if dtype.kind == "O"})
+        if not all(dtype.kind in "buif" for dtype in table.dtypes):
+            raise TypeError(f"evaluator: got {dict(table.dtypes)} from it, allowed are columns of numbers")
         return table
 
 
@@ -87,6 +92,7 @@ def grid(
     n: Iterable[int] = (51, 26, 11, 6),
     n_sub: Iterable[int] = (11, 9, 6, 4),
     refine: Iterable[bool] = (True, False),
+    **settings: Any,
 ) -> list[Method]:
     """Methods of the paper's Figure 5 (a-c): all combinations with n_sub ≤ n.
 
@@ -98,6 +104,8 @@ def grid(
         Called as calibrate(n=..., n_sub=...), for example `partial(Calibration.from_stack, stack, z_um)`.
     n, n_sub, refine : iterables
         N, N_sub, and whether the refinement step is done.
+    **settings
+        Of the evaluator, the same for all.
 
     Returns
     -------
@@ -111,7 +119,7 @@ def grid(
         Method(
             evaluator=evaluator,
             calibration=calibrations[pair],
-            settings={"refine": r},
+            settings={"refine": r, **settings},
             label={"n": pair[0], "n_sub": pair[1], "refine": r},
         )
         for pair in pairs

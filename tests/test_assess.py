@@ -170,5 +170,5 @@ def test_refuses(changes, error, message):
 
 @pytest.mark.parametrize("edges", [[1], [1, 1], [2, 1], [0, np.nan], [[0, 1]]])
 def test_refuses_edges(edges):
-    with pytest.raises(ValueError, match="^edges_um: got "):
+    with pytest.raises(ValueError, match=r"^edges_um: got "):
         scores_by_z(ONE, ONE, edges)

@@ -293,13 +293,13 @@ def test_scan_refuses_a_particle_at_the_border(scan, x, y, size, largest):
         f"^size: got {size} px, allowed are odd sizes from 3 to {largest} for a particle at x_px = {x}, y_px = {y}"
     )
     with pytest.raises(ValueError, match=message):
-        Calibration.from_scan(scan[1], Z_UM, x, y, size=size)
+        Calibration.from_scan(scan[1], SCAN_Z_UM, x, y, size=size)
 
 
 @pytest.mark.parametrize(("x", "y"), [(0, 0), (169, 103), (400, 50), (50, 400), (1, 50)])
 def test_scan_refuses_a_particle_on_the_border(scan, x, y):
     with pytest.raises(ValueError, match=f"^x_px, y_px: got a particle at x_px = {x}, y_px = {y} in frames of 170"):
-        Calibration.from_scan(scan[1], Z_UM, x, y)
+        Calibration.from_scan(scan[1], SCAN_Z_UM, x, y)
 
 
 @pytest.mark.parametrize(
@@ -337,7 +337,7 @@ def test_saved_and_loaded_is_the_same_to_the_bit(calibration, tmp_path):
 
 
 def test_saved_under_another_suffix_is_refused(calibration, tmp_path):
-    with pytest.raises(ValueError, match="^path: got 'a.npy', allowed are names that end in .npz"):
+    with pytest.raises(ValueError, match=r"^path: got 'a.npy', allowed are names that end in .npz"):
         calibration.save(tmp_path / "a.npy")
     assert not list(tmp_path.iterdir())
 
@@ -372,7 +372,7 @@ def test_missing_parts_are_refused(calibration, tmp_path, missing):
     parts = arrays(calibration)
     del parts[missing]
     np.savez(tmp_path / "a.npz", gdptlab_calibration=VERSION, **parts)
-    with pytest.raises(ValueError, match="^path: got 'a.npz'"):
+    with pytest.raises(ValueError, match=r"^path: got 'a.npz'"):
         Calibration.load(tmp_path / "a.npz")
 
 
@@ -380,20 +380,20 @@ def test_parts_that_do_not_fit_are_refused(calibration, tmp_path):
     for name in ("stack", "z_um", "templates"):
         parts = arrays(calibration) | {name: arrays(calibration)[name][:-1]}
         np.savez(tmp_path / "a.npz", gdptlab_calibration=VERSION, **parts)
-        with pytest.raises(ValueError, match="^path: got 'a.npz'"):
+        with pytest.raises(ValueError, match=r"^path: got 'a.npz'"):
             Calibration.load(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"no archive", b"\x93NUMPY"])
 def test_other_files_are_refused(tmp_path, content):
     (tmp_path / "a.npz").write_bytes(content)
-    with pytest.raises(ValueError, match="^path: got 'a.npz', which cannot be read as a calibration"):
+    with pytest.raises(ValueError, match=r"^path: got 'a.npz', which cannot be read as a calibration"):
         Calibration.load(tmp_path / "a.npz")
 
 
 def test_a_single_array_is_refused(calibration, tmp_path):
     np.save(tmp_path / "a.npy", calibration.stack)
-    with pytest.raises(ValueError, match="^path: got 'a.npy', which cannot be read as a calibration"):
+    with pytest.raises(ValueError, match=r"^path: got 'a.npy', which cannot be read as a calibration"):
         Calibration.load(tmp_path / "a.npy")
 
 
@@ -407,7 +407,7 @@ def test_truncated_files_are_refused(calibration, tmp_path, share):
     path = tmp_path / "a.npz"
     calibration.save(path)
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    with pytest.raises(ValueError, match="^path: got 'a.npz', which cannot be read as a calibration"):
+    with pytest.raises(ValueError, match=r"^path: got 'a.npz', which cannot be read as a calibration"):
         Calibration.load(path)
 
 
@@ -421,7 +421,7 @@ def test_flipped_bytes_are_refused(calibration, tmp_path):
         content[info.header_offset + 100 + info.compress_size // 2] ^= 0xFF
         damaged = tmp_path / "damaged.npz"
         damaged.write_bytes(content)
-        with pytest.raises(ValueError, match="^path: got 'damaged.npz', which cannot be read as a calibration"):
+        with pytest.raises(ValueError, match=r"^path: got 'damaged.npz', which cannot be read as a calibration"):
             Calibration.load(damaged)
 
 
@@ -444,7 +444,7 @@ def test_pickles_are_refused_and_never_opened(calibration, tmp_path, inside):
         np.savez(path, gdptlab_calibration=VERSION, **(arrays(calibration) | {"subset": bombs}))
     else:
         path.write_bytes(pickle.dumps(Bomb(trace)))
-    with pytest.raises(ValueError, match="^path: got 'a.npz', which cannot be read as a calibration"):
+    with pytest.raises(ValueError, match=r"^path: got 'a.npz', which cannot be read as a calibration"):
         Calibration.load(path)
     assert not trace.exists()
 

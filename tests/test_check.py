@@ -42,7 +42,7 @@ def test_whole_returns_an_int(value):
     ("value", "error"), [(1, ValueError), (6, ValueError), (3.0, TypeError), ("3", TypeError), (True, TypeError)]
 )
 def test_whole_refuses(value, error):
-    with pytest.raises(error, match="^n: got .*, allowed are whole numbers from 2 to 5$"):
+    with pytest.raises(error, match=r"^n: got .*, allowed are whole numbers from 2 to 5$"):
         check.whole("n", value, 2, 5)
 
 

@@ -29,7 +29,7 @@ def test_any_real_type_of_image(image_type, dtype):
 def test_type_by_name_or_function():
     assert as_image_type("disturbed") is disturbed
     assert as_image_type(np.negative) is np.negative
-    with pytest.raises(ValueError, match="^image_type: got 'bright', allowed are 'fluorescent', 'brightfield', 'dis"):
+    with pytest.raises(ValueError, match=r"^image_type: got 'bright', allowed are 'fluorescent', 'brightfield', 'dis"):
         as_image_type("bright")
 
 

@@ -293,7 +293,7 @@ def test_bad_shape(microscope, shape, error, message):
 
 
 def test_bad_image_type_and_size(microscope):
-    with pytest.raises(ValueError, match="^image_type: got 'dark', allowed are"):
+    with pytest.raises(ValueError, match=r"^image_type: got 'dark', allowed are"):
         microscope.render(GOOD, (11, 14), image_type="dark")
     for size, error in ((20, ValueError), (0, ValueError), (21.0, TypeError)):
         with pytest.raises(error, match=f"^size: got {size}, allowed are"):

@@ -304,11 +304,30 @@ def no_depth(image, calibration):
     return pd.DataFrame({"x_px": [1.0], "y_px": [2.0]})
 
 
+def words(image, calibration):
+    return pd.DataFrame({"x_px": [1.0], "y_px": [2.0], "z_um": ["deep"]})
+
+
+def blind(image, calibration):
+    CALLS.append(0)
+    return pd.DataFrame(columns=["x_px", "y_px", "z_um"])
+
+
+def test_an_evaluator_may_see_nothing_and_say_so_without_types():
+    film = small_film()
+    for _ in range(2):
+        table = sweep([film], [Method(evaluator=blind)], progress=False)
+        assert (table["count"] == 0).all()
+        assert table["fraction_h"].isna().all()
+    assert len(CALLS) == len(film)
+
+
 @pytest.mark.parametrize(
     ("method", "error", "match"),
     [
         (Method(evaluator=no_table), TypeError, "list"),
         (Method(evaluator=no_depth), ValueError, "z_um"),
+        (Method(evaluator=words), TypeError, "columns of numbers"),
         (Method(evaluator=no_depth, calibration=object()), TypeError, "cache=False"),
         (Method(evaluator=partial(no_depth)), TypeError, "cache=False"),
         (no_depth, TypeError, "methods"),
