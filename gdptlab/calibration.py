@@ -16,16 +16,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import dctn, idctn
 from scipy.interpolate import make_smoothing_spline
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, median
 from scipy.ndimage import shift as shift_image
 from skimage.registration import phase_cross_correlation
 
 from gdptlab.check import positive, real_array, whole
 from gdptlab.correlation import Correlator, normalised, on_one_core
+from gdptlab.displacement import Displacement
 from gdptlab.files import written_whole
 
 VERSION = 1
 """Of the file format of `Calibration.save`."""
+
+LARGEST = 121
+"""Rows and columns, px, beyond which no size is chosen for a template unasked."""
 
 LOSSLESS = 0.98
 """Templates that keep this correlation with themselves at half resolution are searched for there."""
@@ -152,7 +156,7 @@ class Calibration:
             raise ValueError(f"x_px, y_px: got {where}, allowed is one 3 px or more inside")
         largest = 2 * room + 1
         if size is None:
-            size = _image_size(_cut(scan, x_px, y_px, room))
+            size = _image_size(_cut(scan, x_px, y_px, min(room, LARGEST // 2)))
         if not isinstance(size, Integral) or isinstance(size, bool):
             raise TypeError(f"size: got {size!r}, allowed are odd whole numbers")
         if not 3 <= size <= largest or size % 2 == 0:
@@ -206,9 +210,9 @@ class Calibration:
         return np.minimum(map_, 1)
 
     @cached_property
-    def solvers(self) -> NDArray[np.float32]:
-        """`displacement_solvers` of the templates, (N, 4, n * n)."""
-        return displacement_solvers(self.templates, self.z_um)
+    def displacement(self) -> Displacement:
+        """What finds the part of a pixel and of a step by which a particle is off a template."""
+        return Displacement(self.templates, self.z_um)
 
     def correlator(self, shape: tuple[int, int]) -> Correlator:
         """Plan for correlating frames of this shape with the subset, kept for the next frame."""
@@ -342,29 +346,6 @@ def levelled(images: NDArray) -> NDArray:
     return images - images.mean(axis=(-2, -1), keepdims=True) - down * ramp[:, None] - across * ramp
 
 
-def displacement_solvers(templates: NDArray, z_um: NDArray) -> NDArray[np.float32]:
-    """What turns a window into a particle's brightness and small displacement.
-
-    For each template T the first four rows of the pseudo-inverse of [T, dT/dy, dT/dx, dT/dz, 1, y, x]: their
-    products with a window that shows a T, moved by (dy, dx, dz), are the least-squares a, -a dy, -a dx (px)
-    and a dz (µm), whatever the level and slope of the background.
-
-    Parameters
-    ----------
-    templates : array (N, n, n)
-    z_um : array (N,)
-
-    Returns
-    -------
-    float32 array (N, 4, n * n)
-    """
-    count, n, _ = templates.shape
-    slopes = np.gradient(templates, np.arange(n), np.arange(n), z_um, axis=(1, 2, 0))
-    background = (np.broadcast_to(b, templates.shape) for b in (np.ones((n, n)), *np.indices((n, n)) - n // 2))
-    columns = [c.reshape(count, -1) for c in (templates, *slopes, *background)]
-    return np.linalg.pinv(np.stack(columns, axis=2))[:, :4].astype(np.float32)
-
-
 def noise_level(images: NDArray) -> float:
     """Standard deviation of the noise of a pixel, from differences that smooth structure does not reach.
 
@@ -396,25 +377,23 @@ def _cut(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
     return scan[:, y - half : y + half + 1, x - half : x + half + 1]
 
 
-def _image_size(cut: NDArray, faint: float = 0.1) -> int:
-    """Smallest odd size that holds the particle in every slice of (N, 2 r + 1, 2 r + 1).
+def _image_size(cut: NDArray, faint: float = 0.08) -> int:
+    """Smallest odd size that holds the particle in nearly every slice of (N, 2 r + 1, 2 r + 1).
 
-    An image ends where the mean over a ring about the centre first falls below the share `faint` of the
-    brightest ring's.
+    An image ends where the median over a ring about the centre, which a neighbour does not move, first falls
+    below the share `faint` of the brightest ring's.
     """
     half = cut.shape[-1] // 2
     y, x = np.indices(cut.shape[1:]) - half
-    ring = np.rint(np.hypot(x, y)).astype(int).ravel()
-    inside = ring <= half
-    count = np.bincount(ring[inside])
-    reach = 1
+    ring = np.rint(np.hypot(x, y)).astype(int)
+    reach = []
     for image in denoised(cut):
         light = image - np.median(np.concatenate([image[[0, -1]].ravel(), image[:, [0, -1]].ravel()]))
-        profile = np.abs(np.bincount(ring[inside], weights=light.ravel()[inside]) / count)
+        profile = np.abs(median(light, ring, np.arange(half + 1)))
         brightest = int(profile.argmax())
         faint_from = np.flatnonzero(profile[brightest:] < faint * profile[brightest])
-        reach = max(reach, brightest + int(faint_from[0]) if len(faint_from) else half)
-    return 2 * min(reach, half) + 1
+        reach.append(brightest + int(faint_from[0]) if len(faint_from) else half)
+    return 2 * int(np.percentile(reach, 95)) + 1
 
 
 def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) -> NDArray[np.float64]:

@@ -51,7 +51,7 @@ def brightfield(light: NDArray, white: float = WHITE) -> NDArray:
 
 def disturbed(
     light: NDArray,
-    amplitude: float = 100.0,
+    amplitude: float = 80.0,
     period_px: tuple[float, float] = (512.0, 384.0),
     phase_rad: tuple[float, float] = (0.0, 0.0),
     white: float = WHITE,

@@ -95,7 +95,7 @@ def locate(
         place, step, cm = _refined(image, calibration, place, step)
     else:
         first = _pixels(image, calibration, place)
-        shift = _displacements(_windows(image, first, size), calibration.solvers[best])
+        shift = calibration.displacement(_windows(image, first, size), best)
         place = first + size // 2 + np.clip(shift[:, :2], -1, 1)
     kept = _strongest(place, np.where(cm >= threshold, cm, 0), distance)
     (y, x), step, cm = place[kept].T, step[kept], cm[kept]
@@ -151,12 +151,6 @@ def _windows(image: NDArray[np.float32], place: NDArray, size: int) -> NDArray[n
     return seen - seen.mean(axis=1, keepdims=True)
 
 
-def _displacements(windows: NDArray, solvers: NDArray) -> NDArray:
-    """Least-squares displacement (dy px, dx px, dz µm) in each window, (n, 3); 0 where nothing is bright."""
-    a, *products = np.matmul(solvers, windows[:, :, None])[..., 0].T
-    return (products / np.where(a > 0, a, np.inf)).T * (-1, -1, 1)
-
-
 def _refined(
     image: NDArray[np.float32], calibration: Calibration, place: NDArray, step: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
@@ -174,7 +168,7 @@ def _refined(
         scores = seen @ templates.T / np.where(norm > 0, norm, np.inf)
         step[walking] = k = _uphill(scores, step[walking])
         cm[walking] = scores[np.arange(len(k)), k]
-        shift[walking] = _displacements(seen, calibration.solvers[k])
+        shift[walking] = calibration.displacement(seen, k)
         # Not at half a pixel already, or those half-way would go to and fro.
         move = np.where(np.abs(shift[walking, :2]) > 0.6, np.sign(shift[walking, :2]), 0).astype(int)
         there = there + move

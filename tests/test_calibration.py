@@ -9,7 +9,7 @@ import pytest
 from conftest import CALIBRATION_SEED, IMAGE_TYPES, SIZE_PX, Z_UM, table
 
 from gdptlab import Calibration, locate
-from gdptlab.calibration import VERSION, denoised, displacement_solvers, levelled, noise_level
+from gdptlab.calibration import VERSION, denoised, levelled, noise_level
 from gdptlab.correlation import correlate_plainly, normalised
 
 DENOISED_BY = 4  # times smaller 1 - NCC of the worst image against the noise-free stack, at least
@@ -136,16 +136,6 @@ def test_levelled_takes_out_any_plane():
     np.testing.assert_allclose(levelled(images + 5 + 0.3 * x - 2 * y), level, atol=1e-12)
     for basis in (np.ones((9, 9)), x, y):
         np.testing.assert_allclose((level * basis).sum(axis=(1, 2)), 0, atol=1e-10)
-
-
-@pytest.mark.parametrize(("dx", "dy", "dz"), [(0.3, 0, 0), (0, -0.2, 0), (0, 0, 0.4), (0.1, 0.15, -0.3)])
-def test_solvers_read_a_displacement(microscope, clean_stack, dx, dy, dz):
-    solvers = displacement_solvers(normalised(levelled(clean_stack.astype(np.float32))), Z_UM)
-    y, x = np.indices((SIZE_PX, SIZE_PX))
-    for k in (5, 17, 33, 45):
-        moved = microscope.light(table(30 + dx, 30 + dy, Z_UM[k] + dz), (SIZE_PX, SIZE_PX))
-        a, *products = solvers[k] @ (moved + 40 - 0.7 * x + 1.1 * y).ravel()
-        np.testing.assert_allclose(products / a * np.array((-1, -1, 1)), (dy, dx, dz), atol=0.2)
 
 
 # -------------------- the map and quality figures
