@@ -707,7 +707,7 @@ def score_curves(
     -------
     Figure
     """
-    figure, [axes] = _panels(len(columns), 3.4 * len(columns), 3.1)
+    figure, [axes] = _panels(len(columns), max(3.4 * len(columns), 6), 3.1)
     for panel, column in zip(axes, columns, strict=True):
         for colour, marker, (name, table) in zip(COLOURS, MARKERS, tables.items(), strict=False):
             spread = table.get(f"{column}_std")
@@ -725,6 +725,8 @@ def score_curves(
         panel.set_ylim(0, 1.05 if column != "sigma_z_um" else 1.08 * top)
         if chosen is not None:
             panel.axvline(chosen, color="0.6", lw=1, ls=":", zorder=0)
-    if len(tables) > 1:
+    if len(tables) > 1 and len(columns) == 1:
+        axes[0].legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    elif len(tables) > 1:
         axes[0].legend(loc="lower left")
     return figure
