@@ -298,3 +298,11 @@ def test_bad_image_type_and_size(microscope):
     for size, error in ((20, ValueError), (0, ValueError), (21.0, TypeError)):
         with pytest.raises(error, match=f"^size: got {size}, allowed are"):
             microscope.stack([0, 1], size)
+
+
+def test_paraxial_rays_meet_at_the_focus():
+    """A check of Snell's law on two spheres that knows nothing of the code: 1/f = 1/object + 1/image."""
+    narrow = Microscope(na=0.01, cylinder_um=None)
+    points = np.random.default_rng(1).random((4096, 4))
+    spread = {z: narrow.trace(z, points, diameter_um=1e-3)[0].std() for z in (-8.0, 22.0, 52.0)}
+    assert spread[22.0] < 0.01 * min(spread[-8.0], spread[52.0])  # px
