@@ -21,7 +21,8 @@ from scipy.ndimage import shift as shift_image
 from skimage.registration import phase_cross_correlation
 
 from gdptlab.check import positive, real_array, whole
-from gdptlab.correlation import Correlator, normalised, on_one_core
+from gdptlab.cores import on_one_core
+from gdptlab.correlation import Correlator, normalised
 from gdptlab.displacement import Displacement
 from gdptlab.files import written_whole
 

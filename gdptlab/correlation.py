@@ -9,10 +9,6 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
-
-on_one_core = ThreadpoolController().wrap(limits=1, user_api="blas")
-"""Decorator: products of small matrices are not spread over cores, where they would mostly wait for each other."""
 
 FLAT = 1e-4
 """A window whose contrast is below this share of the image's is taken as flat: its correlation is 0."""

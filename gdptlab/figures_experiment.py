@@ -177,7 +177,11 @@ def forces_and_flow(focusing: Focusing) -> Figure:
 
 @_styled
 def focusing_in_time(
-    t_s: ArrayLike, expected: Mapping[str, ArrayLike], counted: pd.DataFrame, triggers_s: Mapping[str, float], level: float
+    t_s: ArrayLike,
+    expected: Mapping[str, ArrayLike],
+    counted: pd.DataFrame,
+    triggers_s: Mapping[str, float],
+    level: float,
 ) -> Figure:
     """Plot the share of particles in the middle thirds against time, and where it passes the level.
 
@@ -345,9 +349,7 @@ def fig5(
     _counts(last, counts)
     last.set_title(f"({letters[2]})  Valid particles")
     handles = [Line2D([], [], color=c, lw=4, label=f"{names[colour]} {v}".strip()) for v, c in colours.items()]
-    handles += [
-        Line2D([], [], color="0.3", marker=m, ls="", label=f"{names[marker]} {v}") for v, m in markers.items()
-    ]
+    handles += [Line2D([], [], color="0.3", marker=m, ls="", label=f"{names[marker]} {v}") for v, m in markers.items()]
     handles += [
         Line2D([], [], color="0.3", marker="o", ls="", label="refined"),
         Line2D([], [], color="0.3", marker="o", ls="", mfc="white", label="not refined"),
@@ -441,21 +443,23 @@ def templates_and_densities(points: pd.DataFrame, found: pd.DataFrame) -> Figure
     """
     densities, sizes = points["density"].unique(), points["size"].unique()
     figure, axes = _panels(len(densities), 10, 6.6, rows=3, sharey="row")
-    films = int(points["films"].max())
     low, high = points["own_error_s_q25"].min(), points["own_error_s_q75"].max()
     top = high + 0.14 * (high - low)
     for column, density in zip(axes.T, densities, strict=True):
-        for panel, (trigger, symbol) in zip(column, TRIGGERS.items(), strict=False):
+        for panel, trigger in zip(column, TRIGGERS, strict=False):
             panel.axhline(0, color="black", lw=0.8)
-            for i, row in enumerate(points.query("density == @density and trigger == @trigger").to_dict("records")):
+            here = points[(points["density"] == density) & (points["trigger"] == trigger)]
+            for i, row in enumerate(here.to_dict("records")):
                 middle = row["own_error_s_median"]
                 reach = [[middle - row["own_error_s_q25"]], [row["own_error_s_q75"] - middle]]
                 look = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 6, "capsize": 3}
                 panel.errorbar(i, middle, yerr=reach, **look)
-                failed = round(films * row["failed"] / max(row["replays"], 1))
+                failed = round(row["films"] * row["failed"] / max(row["replays"], 1))
                 mark = "× " if failed else ""
-                panel.annotate(f"{mark}{failed}/{films}", (i, top), color=COLOURS[i], ha="center", va="center")
-            panel.set(xticks=range(len(sizes)), xlim=(-0.5, len(sizes) - 0.5), ylim=(low - 0.1, top + 0.1 * (high - low)))
+                panel.annotate(f"{mark}{failed}/{row['films']}", (i, top), color=COLOURS[i], ha="center", va="center")
+            panel.set(
+                xticks=range(len(sizes)), xlim=(-0.5, len(sizes) - 0.5), ylim=(low - 0.1, top + 0.1 * (high - low))
+            )
             panel.set_xticklabels([f"{s} px" for s in sizes])
         for i, (size, part) in enumerate(found[found["density"] == density].groupby("size", sort=False)):
             column[2].plot(part["t_s"], part["share"], color=COLOURS[i], ls=_LINES[i], label=f"{size} px")
@@ -503,7 +507,9 @@ def replay_view(film: Film, measured: pd.DataFrame, monitor: pd.DataFrame, frame
     section = axes["section"]
     _limited(section, channel)
     section.plot(true["y_um"], true["z_um"], "x", color="0.35", ms=5, label="true")
-    section.scatter(here["y_um"], here["z_um"], c=here["z_um"], cmap=DEPTH, vmin=-half, vmax=half, s=26, label="measured")
+    section.scatter(
+        here["y_um"], here["z_um"], c=here["z_um"], cmap=DEPTH, vmin=-half, vmax=half, s=26, label="measured"
+    )
     figure.colorbar(circles, ax=section, label="z (µm)")
     section.set(xlabel="y (µm)", ylabel="z (µm)", title=f"{len(here)} measured (dots) of {len(true)} (crosses)")
     _monitor(axes["shares"], monitor[monitor["frame"] <= frame])

@@ -153,6 +153,9 @@ class Camera:
                 gain = self.electrons_per_count
                 counts = rng.poisson(counts * gain).astype(np.float32) / np.float32(gain)
             if self.read_noise:
-                counts = counts + np.float32(self.read_noise) * rng.standard_normal(counts.shape, np.float32)
-        counts = np.rint(counts + np.float32(self.background))
-        return np.clip(counts, 0, 2**self.bit_depth - 1).astype(np.uint16)
+                noise = rng.standard_normal(counts.shape, np.float32)
+                noise *= np.float32(self.read_noise)
+                counts += noise
+        counts += np.float32(self.background)
+        np.clip(np.rint(counts, out=counts), 0, 2**self.bit_depth - 1, out=counts)
+        return counts.astype(np.uint16)

@@ -28,7 +28,7 @@ from tqdm.auto import tqdm
 
 from gdptlab.calibration import Calibration
 from gdptlab.check import positive, real_array, whole
-from gdptlab.correlation import on_one_core
+from gdptlab.cores import on_one_core
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""

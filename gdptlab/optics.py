@@ -21,6 +21,7 @@ from scipy.interpolate import make_lsq_spline
 from scipy.stats import qmc
 
 from gdptlab.check import number, positive, whole
+from gdptlab.cores import on_one_core
 from gdptlab.files import cache_folder, written_whole
 from gdptlab.imagetypes import Camera, as_image_type
 
@@ -225,6 +226,7 @@ class Microscope:
         """
         return (camera or Camera()).record(as_image_type(image_type)(self.light(particles, shape)), rng)
 
+    @on_one_core
     def light(self, particles: pd.DataFrame, shape: tuple[int, int] = (512, 512)) -> NDArray[np.float32]:
         """Light of many particles on the sensor, in counts, without camera (see `render`).
 
@@ -232,33 +234,36 @@ class Microscope:
         sub-pixel offsets (`Library`) and placed from there by linear interpolation.
         """
         shape = tuple(whole(f"shape[{i}]", n, 1, 2**20) for i, n in enumerate(shape))
-        table = self._checked(particles)
+        places, brightness, diameters = self._checked(particles)
         frame = np.zeros(shape, dtype=np.float32)
-        for diameter, group in table.groupby("diameter_um"):
-            library = _library(self, float(diameter))
-            size = (diameter / self.diameter_um) ** 2
-            for x, y, z, brightness in group[["x_px", "y_px", "z_um", "brightness"]].to_numpy().tolist():
-                library.place(frame, x, y, z, brightness * size)
+        for diameter in np.unique(diameters).tolist():
+            library = _library(self, diameter)
+            of_this = diameters == diameter
+            scales = brightness[of_this] * (diameter / self.diameter_um) ** 2
+            for (x, y, z), scale in zip(places[of_this].tolist(), scales.tolist(), strict=True):
+                library.place(frame, x, y, z, scale)
         return frame
 
-    def _checked(self, particles: pd.DataFrame) -> pd.DataFrame:
+    def _checked(self, particles: pd.DataFrame) -> tuple[NDArray, NDArray, NDArray]:
+        """Places (n, 3), brightness (n,) and diameters (n,) of particles that can be rendered."""
         missing = {"x_px", "y_px", "z_um"} - set(particles)
         if missing:
             raise ValueError(f"particles: got no column {sorted(missing)}, needed are x_px, y_px and z_um")
+        places = particles[["x_px", "y_px", "z_um"]].to_numpy(dtype=float)
         defaults = {"brightness": 1.0, "diameter_um": self.diameter_um}
-        table = particles.reindex(columns=["x_px", "y_px", "z_um", *defaults]).astype(float)
-        for name, value in defaults.items():
-            if name not in particles:
-                table[name] = value
-        if not np.isfinite(table.to_numpy()).all():
+        sizes = [
+            particles[name].to_numpy(dtype=float) if name in particles else np.full(len(places), value)
+            for name, value in defaults.items()
+        ]
+        if not all(np.isfinite(values).all() for values in (places, *sizes)):
             raise ValueError("particles: got NaN or infinity, allowed are finite numbers")
-        if len(table) and not (table[["brightness", "diameter_um"]] > 0).all(axis=None):
+        if not all((values > 0).all() for values in sizes):
             raise ValueError("particles: got a brightness or diameter_um of 0 or below, allowed is above 0")
-        deepest = self.depth_um / 2 + MARGIN_UM
-        if len(table) and table["z_um"].abs().max() > deepest:
-            worst = table["z_um"].iloc[table["z_um"].abs().argmax()]
+        deepest, z_um = self.depth_um / 2 + MARGIN_UM, places[:, 2]
+        if len(z_um) and np.abs(z_um).max() > deepest:
+            worst = z_um[np.abs(z_um).argmax()]
             raise ValueError(f"particles: got z_um = {worst:.6g}, allowed is from {-deepest} to {deepest}")
-        return table
+        return places, *sizes
 
     def stack(
         self,

@@ -409,7 +409,8 @@ def sweep(
         triggers = {f"true_{a}_s": trigger_time(film.times_s, truth[f"fraction_{a}"], level) for a in "hw"}
         seen = truth.iloc[frames].add_prefix("true_").reset_index(drop=True)
         name = {"seed": film.seed, "image_type": film.image_type}
-        tables = evaluate(film, methods, every=every, n_jobs=n_jobs, cache=cache, progress=progress)
+        bar = progress and len(films) == 1  # one bar is enough
+        tables = evaluate(film, methods, every=every, n_jobs=n_jobs, cache=cache, progress=bar)
         for method, table in zip(methods, tables, strict=True):
             monitor = fractions(film.to_channel(table), frames, channel)
             monitor.insert(1, "t_s", film.times_s[frames])
