@@ -129,7 +129,7 @@ def fig4_acoustophoresis(trajectories: Trajectories, times_s: Sequence[float]) -
     axes.set_xlabel("x (µm), downstream", labelpad=14)
     axes.set(ylabel="y (µm)", zlabel="z (µm)", xlim=(0, length), zticks=(-h / 2, 0, h / 2))
     axes.set(yticks=(-w / 2, 0, w / 2), ylim=(-w / 2, w / 2), zlim=(-h / 2, h / 2))
-    axes.set_box_aspect((length, w, h), zoom=0.98)
+    axes.set_box_aspect((length, w, h), zoom=0.9)
     axes.view_init(elev=22, azim=-58)
     axes.legend(loc="upper right")
     lower.suptitle("(c)  Cross-sections of the field of view", x=0.01, ha="left", weight="bold", fontsize=11)
@@ -142,6 +142,7 @@ def fig4_acoustophoresis(trajectories: Trajectories, times_s: Sequence[float]) -
         panel.set_title(f"t = {t:g} s", loc="center")
         shares = ",  ".join(f"{share.mean():.0%} in {a}/3" for a, share in inside.items())
         panel.set(xlabel=f"y (µm)\n{shares}", xticks=(-w / 2, 0, w / 2), yticks=(-h / 2, 0, h / 2))
+        panel.xaxis.label.set_size("small")
     panels[0].set_ylabel("z (µm)")
     return figure
 
