@@ -18,6 +18,8 @@ from gdptlab.files import written_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 
+WIDGET = "application/vnd.jupyter.widget-view+json"
+
 
 def select(names: Sequence[str], notebooks: Sequence[Path]) -> list[Path]:
     """Find the `notebooks` of these `names` (stem, file name or leading number), in that order, each once."""
@@ -62,6 +64,9 @@ def execute(notebook: Path) -> str:
             coalesce_streams=True,
         ).execute(cwd=str(notebook.parent))
         document.metadata = metadata
+        for part in document.cells:  # a progress bar is no result, and comes back from the file at 0 %
+            if part.cell_type == "code":
+                part.outputs = [o for o in part.outputs if WIDGET not in o.get("data", {})]
         with written_whole(notebook) as temporary:
             nbformat.write(document, temporary)
     except Exception as error:  # whatever it is, the other notebooks still get their turn

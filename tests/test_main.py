@@ -109,3 +109,12 @@ def test_no_notebooks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         main([], root=tmp_path)
     assert leaving.value.code == 2
     assert f"no notebooks in {tmp_path / 'notebooks'}" in capsys.readouterr().err
+
+
+def test_progress_bars_are_not_kept(root: Path) -> None:
+    notebook = root / "notebooks" / "01_first.ipynb"
+    view = "{'application/vnd.jupyter.widget-view+json': {'model_id': 'a'}, 'text/plain': '0%'}"
+    write(notebook, f"from IPython.display import display\ndisplay({view}, raw=True)\nprint('done')")
+    run([notebook], root / "figures")
+    (kept,) = outputs(notebook)
+    assert [output.output_type for output in kept] == ["stream"]
