@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import dctn, idctn
 from scipy.interpolate import make_smoothing_spline
-from scipy.ndimage import gaussian_filter, median
+from scipy.ndimage import gaussian_filter, median, uniform_filter1d
 from scipy.ndimage import shift as shift_image
 from skimage.registration import phase_cross_correlation
 
@@ -31,6 +31,9 @@ VERSION = 1
 
 LARGEST = 121
 """Rows and columns, px, beyond which no size is chosen for a template unasked."""
+
+REPEATS = 4
+"""Of making the calibration again, to see what noise does to it."""
 
 LOSSLESS = 0.98
 """Templates that keep this correlation with themselves at half resolution are searched for there."""
@@ -192,6 +195,59 @@ class Calibration:
     def search_templates(self) -> NDArray[np.float32]:
         """Templates at the resolution of the search, (N, m, m), each with mean 0 and norm 1."""
         return normalised(_halved(self.templates)) if self.half_resolution else self.templates
+
+    def at_search_resolution(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Images (k, n, n) at the resolution of the search, the middle pixel again in the middle."""
+        return _halved(images) if self.half_resolution else images
+
+    @cached_property
+    def images(self) -> NDArray[np.float32]:
+        """The particle's own light, (N, n, n): the stack, denoised, less its background, in the stack's counts.
+
+        Templates have no level and no slope; here both are put back but for the background, which is that of
+        the images whose outermost pixels are faintest (most bright, for dark particles): there the particle
+        is smallest.
+        """
+        flat = self.templates.reshape(len(self), -1)
+        strength = np.einsum("kp,kp->k", levelled(self.stack).reshape(len(self), -1), flat)
+        smooth = strength[:, None, None] * self.templates
+        tilt = self.stack - levelled(self.stack)
+        if len(self) >= 5:
+            corners = tilt[:, [0, 0, -1], [0, -1, 0]]
+            corners = np.stack([make_smoothing_spline(self.z_um, c)(self.z_um) for c in corners.T.astype(float)])
+            ramp = np.linspace(0, 1, self.size)
+            origin, right, down = corners[:, :, None, None]
+            tilt = origin + (right - origin) * ramp + (down - origin) * ramp[:, None]
+        rim = np.ones(self.stack.shape[1:], dtype=bool)
+        rim[1:-1, 1:-1] = False
+        level = (smooth + tilt)[:, rim].mean(axis=1)
+        bright = np.sign((smooth[:, self.size // 2, self.size // 2] - smooth[:, rim].mean(axis=1)).sum()) or 1
+        above = bright * level - (bright * level).min()
+        small = above < max(noise_level(self.stack) / 4, np.median(above) / 50)
+        y, x = np.nonzero(rim) - np.array(self.size // 2)
+        terms = np.stack([np.ones(len(x)), x, y, x * y], axis=1)
+        fit = np.linalg.lstsq(terms, self.stack[small][:, rim].mean(axis=0), rcond=None)[0]
+        y, x = np.indices(rim.shape) - self.size // 2
+        background = fit[0] + fit[1] * x + fit[2] * y + fit[3] * x * y
+        return (smooth + tilt - background).astype(np.float32)
+
+    @cached_property
+    def own_error(self) -> NDArray[np.float64]:
+        """What the noise of the stack does to positions measured with it: RMS error (N, 3) of x, y (px) and z (µm).
+
+        The error is that of every particle at that depth, so it does not average out. It is found by making
+        the calibration again, from its own images with fresh noise of the stack's strength.
+        """
+        truth, noise = self.images.astype(np.float64), noise_level(self.stack)
+        slopes = [np.gradient(truth, axis=2), np.gradient(truth, axis=1), np.gradient(truth, self.z_um, axis=0)]
+        columns = np.stack([*(-s for s in slopes[:2]), slopes[2], truth, np.ones_like(truth)], axis=-1)
+        rows = np.linalg.pinv(columns.reshape(len(self), -1, 5))[:, :3]
+        errors = []
+        for seed in range(REPEATS):
+            again = truth + np.random.default_rng(seed).normal(0, noise, truth.shape)
+            images = Calibration.from_stack(again, self.z_um).images
+            errors.append(np.einsum("kip,kp->ki", rows, (images - truth).reshape(len(self), -1)))
+        return np.sqrt(uniform_filter1d(np.mean(np.square(errors), axis=0), 5, axis=0, mode="nearest"))
 
     @cached_property
     def expected(self) -> NDArray[np.float32]:

@@ -16,6 +16,7 @@ template wide.
 """
 
 from collections.abc import Iterable
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -35,6 +36,9 @@ COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": b
 
 ROUNDS = 8
 """Of the refinement's walk, at most. A particle needs one or two."""
+
+BLOCK = 25
+"""Consecutive frames that `batch` hands to a process: long against what it costs to hand them over."""
 
 
 @on_one_core
@@ -82,28 +86,46 @@ def locate(
     >>> list(table)
     ['x_px', 'y_px', 'z_um', 'cm', 'at_end']
     """
-    image = real_array("image", image, 2)
-    size = calibration.size
-    if min(image.shape) < size:
-        raise ValueError(f"image: got shape {image.shape}, allowed is no smaller than a template, {(size, size)}")
-    if not 0 < positive("threshold", threshold) <= 1:
-        raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
-    distance = size / 4 if min_distance_px is None else positive("min_distance_px", min_distance_px, zero=True)
-    image = image - image.mean(dtype=np.float64).astype(np.float32)
+    image, distance = _checked(image, calibration, threshold, min_distance_px)
     place, best, step, cm = _candidates(image, calibration, threshold)
     if refine:
         place, step, cm = _refined(image, calibration, place, step)
     else:
         first = _pixels(image, calibration, place)
-        shift = calibration.displacement(_windows(image, first, size), best)
-        place = first + size // 2 + np.clip(shift[:, :2], -1, 1)
+        shift = calibration.displacement(_windows(image, first, calibration.size), best)
+        place = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
     kept = _strongest(place, np.where(cm >= threshold, cm, 0), distance)
-    (y, x), step, cm = place[kept].T, step[kept], cm[kept]
+    return _table(place[kept], step[kept], cm[kept], calibration)
+
+
+def _checked(
+    image: ArrayLike, calibration: Calibration, threshold: float, min_distance_px: float | None
+) -> tuple[NDArray[np.float32], float]:
+    """Image, less its mean, and distance in px, if all four are what `locate` takes."""
+    size = _size(calibration)
+    image = real_array("image", image, 2)
+    if min(image.shape) < size:
+        raise ValueError(f"image: got shape {image.shape}, allowed is no smaller than a template, {(size, size)}")
+    if not 0 < positive("threshold", threshold) <= 1:
+        raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
+    distance = size / 4 if min_distance_px is None else positive("min_distance_px", min_distance_px, zero=True)
+    return image - image.mean(dtype=np.float64).astype(np.float32), distance
+
+
+def _size(calibration: Calibration) -> int:
+    """Rows and columns of a template, if that is a calibration."""
+    if not isinstance(calibration, Calibration):
+        raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration")
+    return calibration.size
+
+
+def _table(place: NDArray, step: NDArray, cm: NDArray, calibration: Calibration) -> pd.DataFrame:
+    """What `locate` returns, of places (y, x) (n, 2), z in steps of the stack and C_m."""
     last = len(calibration) - 1
     return pd.DataFrame(
         {
-            "x_px": x.astype(float),
-            "y_px": y.astype(float),
+            "x_px": place[:, 1].astype(float),
+            "y_px": place[:, 0].astype(float),
             "z_um": np.interp(step, np.arange(last + 1), calibration.z_um),
             "cm": np.minimum(cm, 1).astype(float),
             "at_end": (step <= 0) | (step >= last),
@@ -235,10 +257,12 @@ def batch(
     Parameters
     ----------
     frames : iterable of arrays (rows, columns)
-        A list, a stack, a generator: read one by one, so that a film need not fit into memory.
+        A list, a stack, a generator: read in blocks of `BLOCK` frames and at most `n_jobs` + 1 blocks ahead,
+        so that a film need not fit into memory.
     calibration : Calibration
     n_jobs : int
-        Processes to spread the frames over; -1 for one per core. The result does not depend on it.
+        Processes to spread the blocks over; -1 for one per core. The result does not depend on it. They
+        take some seconds to start, once, and stay for the next film.
     progress : bool
         Show a progress bar.
     **settings
@@ -252,16 +276,28 @@ def batch(
     Raises
     ------
     TypeError, ValueError
-        As `locate`, for the first frame that is refused.
+        As `locate`: for settings at once, for frames at the first that is refused.
     """
     if n_jobs != -1:
         whole("n_jobs", n_jobs, 1, 10_000)
+    # A blank frame: what is wrong with the settings is refused before the film begins, and what a calibration
+    # makes only when it is needed is made here, not by every process for every block.
+    blank = locate(np.zeros((_size(calibration),) * 2), calibration, **settings)
     total = len(frames) if hasattr(frames, "__len__") else None
-    jobs = (delayed(locate)(frame, calibration, **settings) for frame in frames)
-    tables = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
-    numbered = [
-        table.assign(frame=number)
-        for number, table in enumerate(tqdm(tables, total=total, desc="frames", unit="frame", disable=not progress))
-    ]
-    empty = pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in (COLUMNS | {"frame": int}).items()})
-    return pd.concat(numbered or [empty], ignore_index=True)[["frame", *COLUMNS]]
+    copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
+    blocks = iter(lambda: list(islice(copies, BLOCK)), [])
+    jobs = (delayed(_located)(block, i * BLOCK, calibration, settings) for i, block in enumerate(blocks))
+    tables = [blank.assign(frame=0)]
+    with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
+        for count, table in Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs):
+            tables.append(table)
+            bar.update(count)
+    return pd.concat(tables, ignore_index=True)[["frame", *COLUMNS]]
+
+
+def _located(
+    block: list[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
+) -> tuple[int, pd.DataFrame]:
+    """How many frames are in a block that begins with number `first`, and what is in them."""
+    tables = [locate(frame, calibration, **settings).assign(frame=i) for i, frame in enumerate(block, first)]
+    return len(block), pd.concat(tables, ignore_index=True)

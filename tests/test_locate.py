@@ -12,7 +12,7 @@ from conftest import IMAGE_TYPES, SIZE_PX, Z_UM, on_grid, table
 
 from gdptlab import Calibration, batch, locate, match
 from gdptlab.assess import scores
-from gdptlab.locate import COLUMNS, _refined
+from gdptlab.locate import BLOCK, COLUMNS, _refined
 
 # Isolated particles, the dimmest with a peak of ten times the read noise.
 RECALL, PRECISION = 0.99, 0.97
@@ -370,7 +370,7 @@ def test_batch_takes_any_iterable(few, calibration):
     pd.testing.assert_frame_equal(batch(stack, calibration, progress=False), batch(list(stack), calibration))
 
 
-def test_batch_reads_frames_one_by_one(few, calibration, monkeypatch):
+def test_batch_reads_a_block_at_a_time(few, calibration, monkeypatch):
     """No frame is drawn long before it is needed."""
     done = []
     module = __import__("sys").modules["gdptlab.locate"]
@@ -380,13 +380,25 @@ def test_batch_reads_frames_one_by_one(few, calibration, monkeypatch):
         return locate(*args, **kwargs)
 
     def film():
-        for k in range(4):
-            assert len(done) >= k - 1
+        for k in range(10):
+            assert len(done) >= k - 3
             yield few[0]
 
+    monkeypatch.setattr(module, "BLOCK", 3)
     monkeypatch.setattr(module, "locate", spy)
-    batch(film(), calibration, progress=False)
-    assert len(done) == 4
+    measured = batch(film(), calibration, progress=False)
+    assert len(done) == 11  # and a blank one
+    assert measured["frame"].unique().tolist() == list(range(10))
+
+
+def test_batch_of_a_camera_that_reuses_its_memory(few, calibration):
+    def film():
+        shown = np.empty_like(few[0])
+        for k in range(3):
+            shown[:] = few[0] if k == 1 else 0
+            yield shown
+
+    assert (batch(film(), calibration, progress=False)["frame"] == 1).all()
 
 
 def test_batch_with_frames_without_particles(few, calibration):
@@ -411,9 +423,10 @@ def test_batch_passes_settings_on(few, calibration):
     )
 
 
-def test_number_of_processes_does_not_matter(isolated, calibration):
-    frames = isolated["fluorescent"][0][:4]
+def test_number_of_processes_does_not_matter(few, calibration):
+    frames = [few[0][k % 7 :, k % 5 :] for k in range(2 * BLOCK + 3)]
     one, two = (batch(frames, calibration, n_jobs=n, progress=False) for n in (1, 2))
+    assert one["frame"].nunique() == len(frames)
     pd.testing.assert_frame_equal(one, two, check_exact=True)
 
 
@@ -472,7 +485,15 @@ def test_bad_settings(calibration, settings, error, message):
     with pytest.raises(error, match=message):
         locate(with_value(0), calibration, **settings)
     with pytest.raises(error, match=message):
-        batch([with_value(0)], calibration, progress=False, **settings)
+        batch([], calibration, progress=False, **settings)
+
+
+@pytest.mark.parametrize("wrong", [None, np.zeros((51, 61, 61)), Calibration])
+def test_bad_calibration(wrong):
+    name = type(wrong).__name__
+    for call in (lambda: locate(with_value(0), wrong), lambda: batch([], wrong)):
+        with pytest.raises(TypeError, match=f"^calibration: got a {name}, allowed is a Calibration"):
+            call()
 
 
 @pytest.mark.parametrize(("n_jobs", "error"), [(0, ValueError), (-2, ValueError), (1.5, TypeError)])

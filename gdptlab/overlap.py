@@ -1,0 +1,286 @@
+"""Particles that overlap, found one after the other and fitted all at once.
+
+A frame is taken for a smooth background and the sum of the images of particles, each at its place and depth,
+all of nearly the same brightness; the images come from the calibration. Particles are found, some at a time, by a
+matched filter in what the others leave, and after each time all are fitted together. While much is
+unexplained, frame and images are high-pass filtered: neighbours not found yet are smooth there, and do not
+pull. A particle stays while it explains at least half of what it would explain alone.
+
+In a film the particles of one frame, moved on, are where the next begins.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gdptlab.background import Background
+from gdptlab.calibration import Calibration, noise_level
+from gdptlab.joint_fit import JointFit, fitted
+from gdptlab.matched_filter import MatchedFilter
+from gdptlab.particle_images import ParticleImages
+
+LEAST_GAIN = 20.0
+"""In log-likelihood, of a particle: chi-square of 40 with 4 degrees of freedom, which noise reaches at one place
+in ten million, and a frame has some ten thousand places to be at."""
+
+EXPLAINS = 0.5
+"""Share of what it would explain alone that a particle must explain beside the others."""
+
+KNOWN = 0.02
+"""Spread of brightness, its share, while particles are searched for: as if it were known."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Of the search.
+
+    Attributes
+    ----------
+    blur : float
+        What is subtracted from frame and images, each blurred over so many widths of a template; 0: nothing.
+    whiten : bool
+        Take all that is unexplained for noise (see `MatchedFilter`).
+    share : float
+        Of the gain of a lone particle, that a new one must bring.
+    rounds : int
+        At most.
+    """
+
+    blur: float
+    whiten: bool
+    share: float
+    rounds: int
+
+
+STAGES = (
+    Stage(blur=1 / 20, whiten=True, share=0.5, rounds=4),
+    Stage(blur=1 / 8, whiten=True, share=0.5, rounds=2),
+    Stage(blur=1 / 8, whiten=False, share=0.5, rounds=3),
+    Stage(blur=0, whiten=False, share=0.3, rounds=3),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A frame explained, and all that the next one begins with.
+
+    Attributes
+    ----------
+    fit : JointFit
+    stays : bool array
+        Which of the fit's particles are believed.
+    places : float64 array (P, 4)
+        Of those, and of others that may be there: y, x (px), step along the stack, brightness.
+    velocity : float64 array (P, 3)
+        Of y, x and step, per frame.
+    brightness, spread : float
+        Mean and standard deviation of the particles'.
+    variance : float64 array (3,)
+        Polynomial, highest power first, of a pixel's variance in the light of the particles.
+    """
+
+    fit: JointFit
+    stays: NDArray[np.bool_]
+    places: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    brightness: float
+    spread: float
+    variance: NDArray[np.float64]
+
+
+class Overlap:
+    """Plan for frames of one shape.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    shape : (rows, columns)
+    """
+
+    def __init__(self, calibration: Calibration, shape: tuple[int, int]) -> None:
+        images, noise = _continued(calibration.images), noise_level(calibration.stack)
+        self._size, self._scale = calibration.size, 2 if calibration.half_resolution else 1
+        self._shapes, self._surface = ParticleImages(images, noise), Background(shape, 2 * self._size)
+        searched, small = calibration.at_search_resolution(images), tuple(-(-n // self._scale) for n in shape)
+        self._filter = MatchedFilter(searched, small)
+        self._small_surface = Background(small, 2 * self._size / self._scale)
+        self._blurs = [stage.blur * self._size / self._scale for stage in STAGES]
+        self._small_shapes = [ParticleImages(_high_passed(searched, blur), noise) for blur in self._blurs]
+
+    def first(self, frame: NDArray[np.float32]) -> Explained:
+        """Explain a frame (rows, columns) of which nothing is known."""
+        noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame)), 1e-9)
+        places, brightness = self._search(self._reduced(frame), noise)
+        places[:, :2] *= self._scale
+        spread, variance, behind = KNOWN * brightness, np.array([0, 0, noise**2]), None
+        weight = np.full(frame.shape, noise**-2, dtype=np.float32)
+        for again in (True, False):
+            fit = self._fitted(frame, places, weight, brightness, spread, behind, 3)
+            places, behind = fit.places[self._stays(fit, brightness)], fit.behind
+            brightness, spread = _brightness(places, brightness, spread)
+            variance = _variance(fit.light, fit.residual, noise)
+            if again:
+                places = np.concatenate([places, self._unexplained(fit, noise, brightness)])
+        fit = self._fitted(frame, places, _weight(fit.light, variance), brightness, spread, behind, 2)
+        stays = self._stays(fit, brightness)
+        return Explained(fit, stays, fit.places[stays], np.zeros((stays.sum(), 3)), brightness, spread, variance)
+
+    def following(self, frame: NDArray[np.float32], before: Explained) -> Explained:
+        """Explain the frame after one that is explained. A particle that appears in it is in the table of the next."""
+        start, velocity = before.places, before.velocity
+        places = start + np.pad(velocity, ((0, 0), (0, 1)))
+        weight = _weight(before.fit.light, before.variance)
+        fit = self._fitted(frame, places, weight, before.brightness, before.spread, before.fit.behind, 2)
+        stays = self._stays(fit, before.brightness)
+        places = fit.places[stays]
+        moved = (velocity[stays] + places[:, :3] - start[stays, :3]) / 2
+        brightness, spread = _brightness(places, before.brightness, before.spread)
+        noise = float(np.sqrt(before.variance[-1]))
+        new = self._unexplained(fit, noise, brightness)
+        return Explained(
+            fit,
+            stays,
+            np.concatenate([places, new]),
+            np.concatenate([moved, np.zeros((len(new), 3))]),
+            brightness,
+            spread,
+            _variance(fit.light, fit.residual, noise),
+        )
+
+    def _fitted(self, frame, places, weight, brightness, spread, behind, steps) -> JointFit:
+        return fitted(
+            self._shapes,
+            frame,
+            places,
+            weight,
+            brightness=brightness,
+            spread=spread,
+            steps=steps,
+            surface=self._surface,
+            behind=behind,
+        )
+
+    @staticmethod
+    def _stays(fit: JointFit, brightness: float) -> NDArray[np.bool_]:
+        return (fit.explains > EXPLAINS) & (fit.places[:, 3] > brightness / 2)
+
+    def _unexplained(self, fit: JointFit, noise: float, brightness: float) -> NDArray[np.float64]:
+        """Places of further particles, at full resolution; some may lie outside the frame."""
+        small = self._reduced(fit.residual)
+        new = self._new(small, noise, brightness, whiten=False, share=0.3, outside_px=self._size / 4)
+        return new * (self._scale, self._scale, 1, 1)
+
+    def _reduced(self, frame: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The frame at the resolution of the search."""
+        return cv2.pyrDown(frame) if self._scale == 2 else frame
+
+    def _new(
+        self, residual: NDArray, noise: float, brightness: float, *, whiten: bool, share: float, outside_px: float = 0
+    ) -> NDArray[np.float64]:
+        """Places of further particles in what others leave, at the resolution of the search."""
+        new, _ = self._filter(
+            residual,
+            noise / self._scale,
+            brightness=brightness,
+            spread=0.05 * brightness,
+            whiten=whiten,
+            least=LEAST_GAIN,
+            share=share,
+            apart_px=self._size / 6 / self._scale,
+            outside_px=outside_px / self._scale,
+        )
+        new[:, 3] = brightness
+        return new
+
+    def _search(self, small: NDArray[np.float32], noise: float) -> tuple[NDArray[np.float64], float]:
+        """Places at the resolution of the search, and the particles' brightness."""
+        light, behind = np.zeros_like(small), np.median(small)
+        brightness = self._first_brightness(small - behind, noise)
+        weight = np.full(small.shape, (noise / self._scale) ** -2, dtype=np.float32)
+        places = np.zeros((0, 4))
+        for stage, blur, shapes in zip(STAGES, self._blurs, self._small_shapes, strict=True):
+            for _ in range(stage.rounds):
+                if not stage.whiten:
+                    behind = self._small_surface.fit(small - light, weight)
+                new = self._new(small - behind - light, noise, brightness, whiten=stage.whiten, share=stage.share)
+                if not len(new):
+                    break
+                fit = fitted(
+                    shapes,
+                    _high_passed((small - behind)[None], blur)[0],
+                    np.concatenate([places, new]),
+                    weight,
+                    brightness=brightness,
+                    spread=KNOWN * brightness,
+                    steps=3,
+                )
+                stays = fit.explains > EXPLAINS
+                places = fit.places[stays]
+                if len(places):
+                    # Where all explain more than they should, they are too faint.
+                    brightness *= 1 + np.median(fit.explains[stays] - 1) / 2
+                    places[:, 3] = brightness
+                light = np.zeros_like(small)
+                self._small_shapes[-1].draw(places, small.shape).add_to(light, places[:, 3])
+                if len(new) < 0.02 * len(places):
+                    break
+        return places, brightness
+
+    def _first_brightness(self, small: NDArray[np.float32], noise: float) -> float:
+        """Of the particles that stand out most."""
+        places, gain = self._filter(
+            small,
+            noise / self._scale,
+            whiten=True,
+            least=LEAST_GAIN,
+            share=0,
+            apart_px=self._size / 6 / self._scale,
+        )
+        best = np.argsort(-gain)[: -(-len(gain) // 3)]
+        return float(np.median(places[best, 3])) if len(best) else 1.0
+
+
+def _continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Images that go on beyond their frame, falling to nothing over a sixth of its width: better than an edge."""
+    size = images.shape[1]
+    more = 2 * (size // 12)
+    away = np.abs(np.arange(-more, size + more) - (size - 1) / 2) - size // 2
+    fall = np.clip(1 - away / max(more, 1), 0, 1)
+    return np.pad(images, ((0, 0), (more, more), (more, more)), mode="edge") * np.minimum(fall, fall[:, None])
+
+
+def _high_passed(images: NDArray, blur: float) -> NDArray[np.float32]:
+    """Images (k, rows, columns) less what remains of them when blurred."""
+    images = images.astype(np.float32)
+    if not blur:
+        return images
+    return np.stack([image - cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REFLECT) for image in images])
+
+
+def _brightness(places: NDArray, brightness: float, spread: float) -> tuple[float, float]:
+    """Median brightness of the particles, and how far they scatter about it, never less than so few can tell."""
+    if not len(places):
+        return brightness, spread
+    middle = float(np.median(places[:, 3]))
+    scatter = float(np.median(np.abs(places[:, 3] - middle))) / 0.6745
+    return middle, float(np.hypot(max(scatter, KNOWN * middle), 0.3 * middle / np.sqrt(len(places))))
+
+
+def _variance(light: NDArray, residual: NDArray, noise: float, bins: int = 12) -> NDArray[np.float64]:
+    """Polynomial of a pixel's variance in the particles' light: read noise, photon noise, errors of the images."""
+    light, residual = np.abs(light[::3, ::3]).ravel(), np.abs(residual[::3, ::3]).ravel()  # enough of them
+    rank = np.argsort(light)
+    parts = [part for part in np.array_split(rank, bins) if len(part) > 50]
+    values = np.array([(light[part].mean(), (np.median(residual[part]) / 0.6745) ** 2) for part in parts])
+    if len(values) < 4:
+        return np.array([0, 0, noise**2])
+    return np.polyfit(values[:, 0], values[:, 1], 2, w=1 / np.maximum(values[:, 1], 0.25 * noise**2))
+
+
+def _weight(light: NDArray[np.float32], variance: NDArray[np.float64]) -> NDArray[np.float32]:
+    """One over the variance of each pixel."""
+    square, linear, level = (np.float32(c) for c in variance)
+    light = np.abs(light)
+    return 1 / np.maximum((square * light + linear) * light + level, 0.25 * level)
