@@ -5,11 +5,13 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 """
 
 import os
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Integral
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import cv2
 import numpy as np
@@ -25,6 +27,8 @@ from gdptlab.cores import on_one_core
 from gdptlab.correlation import Correlator, normalised
 from gdptlab.displacement import Displacement
 from gdptlab.files import written_whole
+
+Plan = TypeVar("Plan")
 
 VERSION = 1
 """Of the file format of `Calibration.save`."""
@@ -276,6 +280,17 @@ class Calibration:
         if shape not in self._plans:
             self._plans[shape] = Correlator(self.search_templates[self.subset], shape)
         return self._plans[shape]
+
+    def plan(self, make: Callable[[Self, tuple[int, int]], Plan], shape: tuple[int, int]) -> Plan:
+        """`make(self, shape)`, a plan for frames of this shape, kept for this thread's next frame."""
+        key = make, shape, threading.get_ident()
+        if key not in self._plans:
+            self._plans[key] = make(self, shape)
+        return self._plans[key]
+
+    def __getstate__(self) -> dict[str, object]:
+        """Plans stay behind when a calibration is sent to another process."""
+        return self.__dict__ | {"_plans": {}}
 
     def self_similarity(self) -> NDArray[np.float32]:
         """Correlation of every template with every other, (N, N): what can be told apart, and what cannot."""

@@ -17,9 +17,6 @@ from gdptlab.particle_images import Columns, ParticleImages, compiled
 LONGEST_STEP = np.array([1.5, 1.5, 1.5, 0.2])
 """Of y, x (px), step along the stack and brightness, its share."""
 
-SHORT_STEP = 0.2
-"""Share of the longest step; while nine in ten particles stay below, the matrix need not be made again."""
-
 DAMPING = 1e-3
 """Share by which the diagonal is raised (Levenberg)."""
 
@@ -85,6 +82,7 @@ def fitted(
     steps: int,
     surface: Background | None = None,
     behind: NDArray[np.float32] | None = None,
+    near: bool = False,
 ) -> JointFit:
     """Fit particles from where they are about.
 
@@ -104,6 +102,8 @@ def fitted(
         Fit it as well. Without it the frame has no background.
     behind : float32 array (rows, columns), optional
         Background to begin with; without it, the one that fits what the particles leave.
+    near : bool
+        The places are good to a fraction of a pixel already, so that one matrix serves all steps.
     """
     places, system = places.copy(), None
     if surface is None:
@@ -133,7 +133,7 @@ def fitted(
         places[order] += change
         places[:, 2] = np.clip(places[:, 2], 0, shapes.count - 1)
         places[:, 3] = np.clip(places[:, 3], 0.05 * brightness, 20 * brightness)
-        if np.mean(share.max(axis=1) > SHORT_STEP) > 0.1:
+        if not near:
             system = None
     alone = system.alone * places[order, 3]
     explains = np.zeros(len(places))

@@ -1,4 +1,6 @@
-"""From a frame to a table of particles, by correlation and without segmentation (the paper's section 2).
+"""From a frame to a table of particles, without segmentation.
+
+By correlation (the paper's section 2):
 
 1. The frame is correlated with the N_sub images of the calibration's subset (Figure 2b).
 2. Candidates are local peaks, in any of the maps, above a threshold.
@@ -11,8 +13,8 @@
    best image within that window.
 6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
 
-A particle is measured only if its whole window lies in the frame; nothing is said of a border half a
-template wide.
+A particle is then measured only if its whole window lies in the frame; nothing is said of a border half a
+template wide. Or jointly (`overlap`): particles may overlap and be cut by the frame's edge.
 """
 
 from collections.abc import Iterable
@@ -28,11 +30,15 @@ from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
 from gdptlab.calibration import Calibration
-from gdptlab.check import positive, real_array, whole
+from gdptlab.check import choice, positive, real_array, whole
 from gdptlab.cores import on_one_core
+from gdptlab.overlap import Explained, Overlap
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""
+
+METHODS = ("correlation", "joint")
+"""How `locate` can work."""
 
 ROUNDS = 8
 """Of the refinement's walk, at most. A particle needs one or two."""
@@ -46,6 +52,7 @@ def locate(
     image: ArrayLike,
     calibration: Calibration,
     *,
+    method: str = "correlation",
     threshold: float = 0.5,
     refine: bool = True,
     min_distance_px: float | None = None,
@@ -57,8 +64,11 @@ def locate(
     image : array (rows, columns)
         Any real type, no smaller than a template.
     calibration : Calibration
+    method : str
+        "correlation", or "joint": all particles fitted at once, for those that overlap. That is slower, and
+        it takes the particles to be about equally bright. It finds its own threshold, from the noise.
     threshold : float
-        Lowest C_m of a particle, above 0, at most 1.
+        Of "correlation", as are the next two. Lowest C_m of a particle, above 0, at most 1.
     refine : bool
         Walk along the whole stack to the best C_m. Without it, z comes from the subset's profile alone.
     min_distance_px : float, optional
@@ -69,7 +79,11 @@ def locate(
     DataFrame
         A row for each particle, highest C_m first. `x_px` to the right and `y_px` down, the first pixel's
         centre at (0, 0); `z_um` in the depths of the calibration; `cm`, the correlation with the best image;
-        `at_end`, whether that is the stack's first or last image, so that z may lie beyond it.
+        `at_end`, whether that is the stack's first or last image, so that z may lie beyond it. With
+        "joint" also `x_std_px`, `y_std_px` and `z_std_um`, standard deviations (noise of the frame and of the
+        calibration, neighbours considered); `brightness`, 1 for that of the calibration's particle; and
+        `chi2`, the mean square of what is left around the particle, in units of the noise: well above 1 for
+        what is no particle of this kind.
 
     Raises
     ------
@@ -86,6 +100,10 @@ def locate(
     >>> list(table)
     ['x_px', 'y_px', 'z_um', 'cm', 'at_end']
     """
+    if choice("method", method, METHODS) == "joint":
+        if (threshold, refine, min_distance_px) != (0.5, True, None):
+            raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
+        return _overlapping(image, calibration, None)[0]
     image, distance = _checked(image, calibration, threshold, min_distance_px)
     place, best, step, cm = _candidates(image, calibration, threshold)
     if refine:
@@ -102,14 +120,22 @@ def _checked(
     image: ArrayLike, calibration: Calibration, threshold: float, min_distance_px: float | None
 ) -> tuple[NDArray[np.float32], float]:
     """Image, less its mean, and distance in px, if all four are what `locate` takes."""
+    image = _image(image, calibration)
+    if not 0 < positive("threshold", threshold) <= 1:
+        raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
+    distance = (
+        calibration.size / 4 if min_distance_px is None else positive("min_distance_px", min_distance_px, zero=True)
+    )
+    return image - image.mean(dtype=np.float64).astype(np.float32), distance
+
+
+def _image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
+    """Image, if it is one that holds at least a template."""
     size = _size(calibration)
     image = real_array("image", image, 2)
     if min(image.shape) < size:
         raise ValueError(f"image: got shape {image.shape}, allowed is no smaller than a template, {(size, size)}")
-    if not 0 < positive("threshold", threshold) <= 1:
-        raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
-    distance = size / 4 if min_distance_px is None else positive("min_distance_px", min_distance_px, zero=True)
-    return image - image.mean(dtype=np.float64).astype(np.float32), distance
+    return image
 
 
 def _size(calibration: Calibration) -> int:
@@ -131,6 +157,35 @@ def _table(place: NDArray, step: NDArray, cm: NDArray, calibration: Calibration)
             "at_end": (step <= 0) | (step >= last),
         }
     )
+
+
+def _overlapping(
+    image: ArrayLike, calibration: Calibration, before: Explained | None
+) -> tuple[pd.DataFrame, Explained]:
+    """Table of a frame by the joint fit, and where the next frame may begin."""
+    image = _image(image, calibration)
+    plan = calibration.plan(Overlap, image.shape)
+    if before is None or before.fit.residual.shape != image.shape:
+        explained = plan.first(image)
+    else:
+        explained = plan.following(image, before)
+    fit = explained.fit
+    y, x, step, brightness = fit.places.T
+    inside = explained.stays & (y >= -0.5) & (y < image.shape[0] - 0.5) & (x >= -0.5) & (x < image.shape[1] - 0.5)
+    table = _table(fit.places[:, :2], step, fit.cm, calibration)
+    steps = np.arange(len(calibration))
+    per_step = np.interp(step, steps, np.gradient(calibration.z_um))
+    names = ("x_std_px", "y_std_px", "z_std_um")
+    for name, own, std in zip(
+        names,
+        calibration.own_error.T,
+        (fit.std * np.stack([0 * y + 1, 0 * y + 1, per_step], 1)).T[[1, 0, 2]],
+        strict=True,
+    ):
+        table[name] = np.hypot(std, np.interp(step, steps, own))
+    table["brightness"], table["chi2"] = brightness, fit.chi2
+    order = np.argsort(-table["cm"].to_numpy(), kind="stable")
+    return table.iloc[order[inside[order]]].reset_index(drop=True), explained
 
 
 def _candidates(
@@ -266,7 +321,8 @@ def batch(
     progress : bool
         Show a progress bar.
     **settings
-        Of `locate`.
+        Of `locate`. With method "joint" the frames should follow each other: within a block each begins with
+        the particles of the last, and one that appears is in the table from the next frame on.
 
     Returns
     -------
@@ -292,12 +348,18 @@ def batch(
         for count, table in Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs):
             tables.append(table)
             bar.update(count)
-    return pd.concat(tables, ignore_index=True)[["frame", *COLUMNS]]
+    return pd.concat(tables, ignore_index=True)[["frame", *blank]]
 
 
 def _located(
     block: list[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
 ) -> tuple[int, pd.DataFrame]:
     """How many frames are in a block that begins with number `first`, and what is in them."""
-    tables = [locate(frame, calibration, **settings).assign(frame=i) for i, frame in enumerate(block, first)]
+    tables, before = [], None
+    for i, frame in enumerate(block, first):
+        if settings.get("method") == "joint":
+            table, before = on_one_core(_overlapping)(frame, calibration, before)
+        else:
+            table = locate(frame, calibration, **settings)
+        tables.append(table.assign(frame=i))
     return len(block), pd.concat(tables, ignore_index=True)

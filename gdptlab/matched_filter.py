@@ -24,7 +24,7 @@ SMOOTHING = 4.0
 
 
 class MatchedFilter:
-    """Plan for searching frames of one shape.
+    """Plan for searching frames of one shape, in one thread at a time: it keeps its working memory.
 
     Parameters
     ----------
@@ -51,6 +51,8 @@ class MatchedFilter:
         twice = np.r_[1, np.full(spectra.shape[-1] - 2, 2), 1]  # half of the spectrum is its mirror image
         power = np.abs(spectra) ** 2 * (twice / np.prod(self._padded))
         self._power = power.reshape(len(power), -1).astype(np.float32)
+        self._maps = np.empty((len(self._spectra), *self._padded), dtype=np.float32)
+        self._products = np.empty((len(self._mix), *self._padded), dtype=np.float32)
 
     def __call__(
         self,
@@ -104,16 +106,15 @@ class MatchedFilter:
         else:
             spectrum /= np.float32(noise**2)
             energy = self._energy[:, -1, -1] / noise**2
-        maps = np.empty((len(self._spectra), *self._padded), dtype=np.float32)
-        for map_, image in zip(maps, self._spectra, strict=True):
+        for map_, image in zip(self._maps, self._spectra, strict=True):
             product = cv2.mulSpectrums(spectrum, image, 0, conjB=True)
             cv2.idft(product, map_, flags=cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
-        products = (self._mix @ maps.reshape(len(maps), -1)).reshape(-1, *self._padded)
+        np.matmul(self._mix, self._maps.reshape(len(self._maps), -1), out=self._products.reshape(len(self._mix), -1))
         cut = self._energy * (energy / self._energy[:, -1, -1])[:, None, None]
         known = 0.0 if np.isinf(spread) else spread**-2
         gain, bright = (np.zeros((rows + 2 * pad, columns + 2 * pad), np.float32) for _ in range(2))
         best = np.zeros(gain.shape, np.int32)
-        _gain(products, cut.astype(np.float32), rows, columns, brightness, known, share, gain, best, bright)
+        _gain(self._products, cut.astype(np.float32), rows, columns, brightness, known, share, gain, best, bright)
 
         width = 2 * max(round(apart_px), 1) + 1
         near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))

@@ -56,7 +56,6 @@ class Stage:
 
 STAGES = (
     Stage(blur=1 / 20, whiten=True, share=0.5, rounds=4),
-    Stage(blur=1 / 8, whiten=True, share=0.5, rounds=2),
     Stage(blur=1 / 8, whiten=False, share=0.5, rounds=3),
     Stage(blur=0, whiten=False, share=0.3, rounds=3),
 )
@@ -91,7 +90,7 @@ class Explained:
 
 
 class Overlap:
-    """Plan for frames of one shape.
+    """Plan for frames of one shape, in one thread at a time.
 
     Parameters
     ----------
@@ -111,13 +110,13 @@ class Overlap:
 
     def first(self, frame: NDArray[np.float32]) -> Explained:
         """Explain a frame (rows, columns) of which nothing is known."""
-        noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame)), 1e-9)
+        noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame))) or 1.0  # a blank frame has none
         places, brightness = self._search(self._reduced(frame), noise)
         places[:, :2] *= self._scale
         spread, variance, behind = KNOWN * brightness, np.array([0, 0, noise**2]), None
         weight = np.full(frame.shape, noise**-2, dtype=np.float32)
         for again in (True, False):
-            fit = self._fitted(frame, places, weight, brightness, spread, behind, 3)
+            fit = self._fitted(frame, places, weight, brightness, spread, behind, 2)
             places, behind = fit.places[self._stays(fit, brightness)], fit.behind
             brightness, spread = _brightness(places, brightness, spread)
             variance = _variance(fit.light, fit.residual, noise)
@@ -132,7 +131,7 @@ class Overlap:
         start, velocity = before.places, before.velocity
         places = start + np.pad(velocity, ((0, 0), (0, 1)))
         weight = _weight(before.fit.light, before.variance)
-        fit = self._fitted(frame, places, weight, before.brightness, before.spread, before.fit.behind, 2)
+        fit = self._fitted(frame, places, weight, before.brightness, before.spread, before.fit.behind, 2, near=True)
         stays = self._stays(fit, before.brightness)
         places = fit.places[stays]
         moved = (velocity[stays] + places[:, :3] - start[stays, :3]) / 2
@@ -149,7 +148,7 @@ class Overlap:
             _variance(fit.light, fit.residual, noise),
         )
 
-    def _fitted(self, frame, places, weight, brightness, spread, behind, steps) -> JointFit:
+    def _fitted(self, frame, places, weight, brightness, spread, behind, steps, near=False) -> JointFit:
         return fitted(
             self._shapes,
             frame,
@@ -160,6 +159,7 @@ class Overlap:
             steps=steps,
             surface=self._surface,
             behind=behind,
+            near=near,
         )
 
     @staticmethod
@@ -197,14 +197,16 @@ class Overlap:
     def _search(self, small: NDArray[np.float32], noise: float) -> tuple[NDArray[np.float64], float]:
         """Places at the resolution of the search, and the particles' brightness."""
         light, behind = np.zeros_like(small), np.median(small)
-        brightness = self._first_brightness(small - behind, noise)
+        new, brightness = self._first_look(small - behind, noise)
         weight = np.full(small.shape, (noise / self._scale) ** -2, dtype=np.float32)
         places = np.zeros((0, 4))
         for stage, blur, shapes in zip(STAGES, self._blurs, self._small_shapes, strict=True):
             for _ in range(stage.rounds):
                 if not stage.whiten:
                     behind = self._small_surface.fit(small - light, weight)
-                new = self._new(small - behind - light, noise, brightness, whiten=stage.whiten, share=stage.share)
+                if len(places):
+                    rest = small - behind - light
+                    new = self._new(rest, noise, brightness, whiten=stage.whiten, share=stage.share)
                 if not len(new):
                     break
                 fit = fitted(
@@ -214,7 +216,7 @@ class Overlap:
                     weight,
                     brightness=brightness,
                     spread=KNOWN * brightness,
-                    steps=3,
+                    steps=2,
                 )
                 stays = fit.explains > EXPLAINS
                 places = fit.places[stays]
@@ -224,12 +226,12 @@ class Overlap:
                     places[:, 3] = brightness
                 light = np.zeros_like(small)
                 self._small_shapes[-1].draw(places, small.shape).add_to(light, places[:, 3])
-                if len(new) < 0.02 * len(places):
+                if len(new) < 0.05 * len(places):
                     break
         return places, brightness
 
-    def _first_brightness(self, small: NDArray[np.float32], noise: float) -> float:
-        """Of the particles that stand out most."""
+    def _first_look(self, small: NDArray[np.float32], noise: float) -> tuple[NDArray[np.float64], float]:
+        """Particles that stand out, and the brightness of those that stand out most."""
         places, gain = self._filter(
             small,
             noise / self._scale,
@@ -239,7 +241,10 @@ class Overlap:
             apart_px=self._size / 6 / self._scale,
         )
         best = np.argsort(-gain)[: -(-len(gain) // 3)]
-        return float(np.median(places[best, 3])) if len(best) else 1.0
+        brightness = float(np.median(places[best, 3])) if len(best) else 1.0
+        places = places[np.abs(np.log(places[:, 3] / brightness)) < np.log(2)]
+        places[:, 3] = brightness
+        return places, brightness
 
 
 def _continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -271,6 +276,8 @@ def _brightness(places: NDArray, brightness: float, spread: float) -> tuple[floa
 def _variance(light: NDArray, residual: NDArray, noise: float, bins: int = 12) -> NDArray[np.float64]:
     """Polynomial of a pixel's variance in the particles' light: read noise, photon noise, errors of the images."""
     light, residual = np.abs(light[::3, ::3]).ravel(), np.abs(residual[::3, ::3]).ravel()  # enough of them
+    if not light.any():
+        return np.array([0, 0, noise**2])
     rank = np.argsort(light)
     parts = [part for part in np.array_split(rank, bins) if len(part) > 50]
     values = np.array([(light[part].mean(), (np.median(residual[part]) / 0.6745) ** 2) for part in parts])
