@@ -15,6 +15,7 @@ from typing import Self, TypeVar
 
 import cv2
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import dctn, idctn
 from scipy.interpolate import make_smoothing_spline
@@ -236,6 +237,54 @@ class Calibration:
         return (smooth + tilt - background).astype(np.float32)
 
     @cached_property
+    def _columns(self) -> NDArray[np.float64]:
+        """How each image changes with x, y, z, brightness and background: (N, n * n, 5)."""
+        images = self.images.astype(np.float64)
+        down, across = (np.gradient(images, axis=axis) for axis in (1, 2))
+        along_z = np.gradient(images, self.z_um, axis=0)
+        columns = np.stack([-across, -down, along_z, images, np.ones_like(images)], axis=-1)
+        return columns.reshape(len(self), -1, 5)
+
+    def expected_error(
+        self, noise: float | None = None, *, electrons_per_count: float | None = None, brightness: float = 1.0
+    ) -> pd.DataFrame:
+        """Least error with which a lone particle can be measured: the Cramér-Rao bound.
+
+        Brightness and level of the background are unknown too. The bound is for the frame's noise alone; what
+        the noise of the calibration adds is `own_error`.
+
+        Parameters
+        ----------
+        noise : float, optional
+            Standard deviation of a pixel of the frame without light; that of the stack if not given.
+        electrons_per_count : float, optional
+            Photo-electrons behind a count of light, which then has Poisson noise; none if not given.
+        brightness : float
+            Of the particle, 1 for the calibration's.
+
+        Returns
+        -------
+        DataFrame
+            A row for each image: `z_um`, and standard deviations `x_std_px`, `y_std_px`, `z_std_um`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is no number above 0.
+        """
+        noise = positive("noise", max(noise_level(self.stack), 1e-9) if noise is None else noise)
+        brightness = positive("brightness", brightness)
+        variance = np.full(self.images.shape, noise**2)
+        if electrons_per_count is not None:
+            light = brightness * np.abs(self.images)
+            variance += light / positive("electrons_per_count", electrons_per_count)
+        columns = brightness * self._columns / np.sqrt(variance).reshape(len(self), -1, 1)
+        covariance = np.linalg.inv(columns.transpose(0, 2, 1) @ columns)
+        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        names = ("x_std_px", "y_std_px", "z_std_um")
+        return pd.DataFrame({"z_um": self.z_um} | {name: std[:, i] for i, name in enumerate(names)})
+
+    @cached_property
     def own_error(self) -> NDArray[np.float64]:
         """What the noise of the stack does to positions measured with it: RMS error (N, 3) of x, y (px) and z (µm).
 
@@ -243,9 +292,7 @@ class Calibration:
         the calibration again, from its own images with fresh noise of the stack's strength.
         """
         truth, noise = self.images.astype(np.float64), noise_level(self.stack)
-        slopes = [np.gradient(truth, axis=2), np.gradient(truth, axis=1), np.gradient(truth, self.z_um, axis=0)]
-        columns = np.stack([*(-s for s in slopes[:2]), slopes[2], truth, np.ones_like(truth)], axis=-1)
-        rows = np.linalg.pinv(columns.reshape(len(self), -1, 5))[:, :3]
+        rows = np.linalg.pinv(self._columns)[:, :3]
         errors = []
         for seed in range(REPEATS):
             again = truth + np.random.default_rng(seed).normal(0, noise, truth.shape)

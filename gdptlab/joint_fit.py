@@ -154,12 +154,14 @@ class _System:
         band[0] *= 1 + DAMPING
         self._factor = cholesky_banded(band, lower=True, check_finite=False) if band.size else band
         self._mixed = None
+        if surface is not None:
+            self._border = surface.matrix(weight)
+            # The products are good to a few per cent: the background is damped by as much.
+            self._border[np.diag_indices_from(self._border)] *= 1.03
         if surface is not None and band.size:
             self._mixed = surface.products(columns, weight)
             self._solved = self._without(self._mixed)
-            self._border = surface.matrix(weight) - self._mixed.T @ self._solved
-        elif surface is not None:
-            self._border = surface.matrix(weight)
+            self._border -= self._mixed.T @ self._solved
 
     def _without(self, right: NDArray) -> NDArray:
         """Solve as if there were no background."""
@@ -182,7 +184,8 @@ class _System:
         particles = _inverse_diagonal(self._factor)
         if self._mixed is None:
             return particles
-        return particles + np.einsum("ib,bi->i", self._solved, np.linalg.solve(self._border, self._solved.T))
+        background = np.einsum("ib,bi->i", self._solved, np.linalg.solve(self._border, self._solved.T))
+        return particles + np.maximum(background, 0)
 
 
 @compiled

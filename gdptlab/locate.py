@@ -37,6 +37,9 @@ from gdptlab.overlap import Explained, Overlap
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""
 
+STD_COLUMNS = ("x_std_px", "y_std_px", "z_std_um")
+"""More of them, if particles are fitted jointly."""
+
 METHODS = ("correlation", "joint")
 """How `locate` can work."""
 
@@ -171,18 +174,13 @@ def _overlapping(
         explained = plan.following(image, before)
     fit = explained.fit
     y, x, step, brightness = fit.places.T
-    inside = explained.stays & (y >= -0.5) & (y < image.shape[0] - 0.5) & (x >= -0.5) & (x < image.shape[1] - 0.5)
     table = _table(fit.places[:, :2], step, fit.cm, calibration)
     steps = np.arange(len(calibration))
-    per_step = np.interp(step, steps, np.gradient(calibration.z_um))
-    names = ("x_std_px", "y_std_px", "z_std_um")
-    for name, own, std in zip(
-        names,
-        calibration.own_error.T,
-        (fit.std * np.stack([0 * y + 1, 0 * y + 1, per_step], 1)).T[[1, 0, 2]],
-        strict=True,
-    ):
-        table[name] = np.hypot(std, np.interp(step, steps, own))
+    y_std, x_std, step_std = fit.std.T
+    stds = x_std, y_std, step_std * np.interp(step, steps, np.gradient(calibration.z_um))
+    for name, noise, own in zip(STD_COLUMNS, stds, calibration.own_error.T, strict=True):
+        table[name] = np.hypot(noise, np.interp(step, steps, own))
+    inside = explained.stays & (y >= -0.5) & (y < image.shape[0] - 0.5) & (x >= -0.5) & (x < image.shape[1] - 0.5)
     table["brightness"], table["chi2"] = brightness, fit.chi2
     order = np.argsort(-table["cm"].to_numpy(), kind="stable")
     return table.iloc[order[inside[order]]].reset_index(drop=True), explained

@@ -28,6 +28,9 @@ in ten million, and a frame has some ten thousand places to be at."""
 EXPLAINS = 0.5
 """Share of what it would explain alone that a particle must explain beside the others."""
 
+FOLLOWS = 0.8
+"""Share of a frame's particles that must be in the next; otherwise it is no film, and the search begins anew."""
+
 KNOWN = 0.02
 """Spread of brightness, its share, while particles are searched for: as if it were known."""
 
@@ -122,7 +125,7 @@ class Overlap:
             variance = _variance(fit.light, fit.residual, noise)
             if again:
                 places = np.concatenate([places, self._unexplained(fit, noise, brightness)])
-        fit = self._fitted(frame, places, _weight(fit.light, variance), brightness, spread, behind, 2)
+        fit = self._fitted(frame, places, _weight(fit.light, variance), brightness, spread, behind, 3, near=True)
         stays = self._stays(fit, brightness)
         return Explained(fit, stays, fit.places[stays], np.zeros((stays.sum(), 3)), brightness, spread, variance)
 
@@ -133,6 +136,8 @@ class Overlap:
         weight = _weight(before.fit.light, before.variance)
         fit = self._fitted(frame, places, weight, before.brightness, before.spread, before.fit.behind, 2, near=True)
         stays = self._stays(fit, before.brightness)
+        if before.stays.any() and stays.sum() < FOLLOWS * before.stays.sum():
+            return self.first(frame)
         places = fit.places[stays]
         moved = (velocity[stays] + places[:, :3] - start[stays, :3]) / 2
         brightness, spread = _brightness(places, before.brightness, before.spread)
