@@ -40,12 +40,13 @@ class Background:
         -------
         float32 array (rows, columns)
         """
-        surface = np.full_like(frame, np.median(frame[::4, ::4]))
+        level = np.median(frame[::4, ::4])
+        frame, surface = frame - level, np.float32(0)
         for _ in range(2):
             off = np.abs(frame - surface) * np.sqrt(weight)
             trust = weight * np.minimum(1, BOUNDED / np.maximum(off, BOUNDED))
             surface = self.surface(np.linalg.solve(self.matrix(trust), self.gradient(frame, trust)))
-        return surface
+        return level + surface
 
     def gradient(self, residual: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
         """Right-hand side (B,) of weighted least squares for B coefficients."""
@@ -57,7 +58,7 @@ class Background:
         m, n = (along.shape[1] for along in self._along)
         matrix = (self._pairs[0].T @ weight @ self._pairs[1]).reshape(m, m, n, n).transpose(0, 2, 1, 3)
         matrix = matrix.reshape(m * n, m * n).astype(np.float64)
-        # Where the frame says nothing the surface stays small.
+        # Where the frame says nothing the surface stays small (in `fit`, near the median).
         matrix[np.diag_indices(m * n)] += 1e-6 * np.trace(matrix) / (m * n)
         return matrix
 
@@ -83,12 +84,13 @@ def _products(boxes, starts, values, weight, down, across, out):  # pragma: no c
         y0, y1, x0, x1 = boxes[i]
         if y1 <= y0 or x1 <= x0:
             continue
-        width = x1 - x0
+        width, first = x1 - x0, y0 + ((y1 - y0) % EVERY != 1)
         for c in range(4):
-            for r in range(y0 + (y1 - y0) % EVERY // 2, y1, EVERY):
+            for r in range(first, y1, EVERY):
                 k = starts[i] + (r - y0) * width
+                each = np.float32(min(r + 2, y1) - max(r - 1, y0))  # it stands for its neighbours, too
                 for q in range(width):
-                    seen[q] = EVERY * values[c, k + q] * weight[r, x0 + q]
+                    seen[q] = each * values[c, k + q] * weight[r, x0 + q]
                 for b in range(len(across)):
                     if across[b, x0] == 0 and across[b, x1 - 1] == 0:  # few of the splines reach the box
                         continue

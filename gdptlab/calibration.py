@@ -296,7 +296,7 @@ class Calibration:
         errors = []
         for seed in range(REPEATS):
             again = truth + np.random.default_rng(seed).normal(0, noise, truth.shape)
-            images = Calibration.from_stack(again, self.z_um).images
+            images = Calibration.from_stack(again, self.z_um, n_sub=len(self.subset)).images
             errors.append(np.einsum("kip,kp->ki", rows, (images - truth).reshape(len(self), -1)))
         return np.sqrt(uniform_filter1d(np.mean(np.square(errors), axis=0), 5, axis=0, mode="nearest"))
 

@@ -136,7 +136,7 @@ class Overlap:
         weight = _weight(before.fit.light, before.variance)
         fit = self._fitted(frame, places, weight, before.brightness, before.spread, before.fit.behind, 2, near=True)
         stays = self._stays(fit, before.brightness)
-        if before.stays.any() and stays.sum() < FOLLOWS * before.stays.sum():
+        if stays.sum() < max(FOLLOWS * before.stays.sum(), 1):
             return self.first(frame)
         places = fit.places[stays]
         moved = (velocity[stays] + places[:, :3] - start[stays, :3]) / 2
@@ -209,15 +209,16 @@ class Overlap:
             for _ in range(stage.rounds):
                 if not stage.whiten:
                     behind = self._small_surface.fit(small - light, weight)
-                if len(places):
+                if new is None:
                     rest = small - behind - light
                     new = self._new(rest, noise, brightness, whiten=stage.whiten, share=stage.share)
-                if not len(new):
+                found, new = new, None
+                if not len(found):
                     break
                 fit = fitted(
                     shapes,
                     _high_passed((small - behind)[None], blur)[0],
-                    np.concatenate([places, new]),
+                    np.concatenate([places, found]),
                     weight,
                     brightness=brightness,
                     spread=KNOWN * brightness,
@@ -231,7 +232,7 @@ class Overlap:
                     places[:, 3] = brightness
                 light = np.zeros_like(small)
                 self._small_shapes[-1].draw(places, small.shape).add_to(light, places[:, 3])
-                if len(new) < 0.05 * len(places):
+                if len(found) < 0.05 * len(places):
                     break
         return places, brightness
 
@@ -275,20 +276,21 @@ def _brightness(places: NDArray, brightness: float, spread: float) -> tuple[floa
         return brightness, spread
     middle = float(np.median(places[:, 3]))
     scatter = float(np.median(np.abs(places[:, 3] - middle))) / 0.6745
-    return middle, float(np.hypot(max(scatter, KNOWN * middle), 0.3 * middle / np.sqrt(len(places))))
+    return middle, float(np.hypot(max(scatter, KNOWN * middle), 0.1 * middle / np.sqrt(len(places))))
 
 
 def _variance(light: NDArray, residual: NDArray, noise: float, bins: int = 12) -> NDArray[np.float64]:
     """Polynomial of a pixel's variance in the particles' light: read noise, photon noise, errors of the images."""
     light, residual = np.abs(light[::3, ::3]).ravel(), np.abs(residual[::3, ::3]).ravel()  # enough of them
-    if not light.any():
-        return np.array([0, 0, noise**2])
-    rank = np.argsort(light)
-    parts = [part for part in np.array_split(rank, bins) if len(part) > 50]
+    rank, dark = np.argsort(light), np.count_nonzero(light == 0)
+    # Of few particles, light falls on few pixels.
+    parts = [part for part in (rank[:dark], *np.array_split(rank[dark:], bins - 1)) if len(part) > 50]
     values = np.array([(light[part].mean(), (np.median(residual[part]) / 0.6745) ** 2) for part in parts])
     if len(values) < 4:
         return np.array([0, 0, noise**2])
-    return np.polyfit(values[:, 0], values[:, 1], 2, w=1 / np.maximum(values[:, 1], 0.25 * noise**2))
+    variance = np.polyfit(values[:, 0], values[:, 1], 2, w=1 / np.maximum(values[:, 1], 0.25 * noise**2))
+    variance[-1] = max(variance[-1], 0.25 * noise**2)
+    return variance
 
 
 def _weight(light: NDArray[np.float32], variance: NDArray[np.float64]) -> NDArray[np.float32]:
