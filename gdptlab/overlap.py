@@ -28,8 +28,8 @@ in ten million, and a frame has some ten thousand places to be at."""
 EXPLAINS = 0.5
 """Share of what it would explain alone that a particle must explain beside the others."""
 
-FOLLOWS = 0.8
-"""Share of a frame's particles that must be in the next; otherwise it is no film, and the search begins anew."""
+LOST = 0.2
+"""Share of a frame's particles that may be gone in the next (or two of them); if more are, the search begins anew."""
 
 KNOWN = 0.02
 """Spread of brightness, its share, while particles are searched for: as if it were known."""
@@ -136,7 +136,8 @@ class Overlap:
         weight = _weight(before.fit.light, before.variance)
         fit = self._fitted(frame, places, weight, before.brightness, before.spread, before.fit.behind, 2, near=True)
         stays = self._stays(fit, before.brightness)
-        if stays.sum() < max(FOLLOWS * before.stays.sum(), 1):
+        gone = before.stays.sum() - stays.sum()
+        if gone > max(LOST * before.stays.sum(), 2) or not stays.any():
             return self.first(frame)
         places = fit.places[stays]
         moved = (velocity[stays] + places[:, :3] - start[stays, :3]) / 2

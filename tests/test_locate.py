@@ -500,3 +500,171 @@ def test_bad_calibration(wrong):
 def test_bad_number_of_processes(calibration, n_jobs, error):
     with pytest.raises(error, match=f"^n_jobs: got {n_jobs}, allowed are whole numbers from 1"):
         batch([with_value(0)], calibration, n_jobs=n_jobs)
+
+
+# -------------------- joint fit: what comes out, what must not matter, what is refused (accuracy: test_overlap.py)
+
+JOINT = [*COLUMNS, "x_std_px", "y_std_px", "z_std_um", "brightness", "chi2"]
+
+
+def joint(image, calibration):
+    return locate(image, calibration, method="joint")
+
+
+def assert_joint_columns(measured, extra=()):
+    assert list(measured) == [*extra, *JOINT]
+    assert measured.index.tolist() == list(range(len(measured)))
+    for name in JOINT:
+        assert measured[name].dtype == (bool if name == "at_end" else float)
+
+
+def test_joint_table(few, calibration):
+    """The four particles; one row for each, highest C_m first, nothing out of range."""
+    measured = joint(few[0], calibration)
+    assert_joint_columns(measured)
+    assert len(match(measured, few[1], within_px=0.3, within_um=2)) == len(measured) == 4
+    assert measured["cm"].between(0.8, 1).all() and measured["cm"].is_monotonic_decreasing
+    assert (measured[["x_std_px", "y_std_px"]] < 0.2).all(axis=None) and (measured["z_std_um"] < 2).all()
+    assert measured["brightness"].between(0.8, 1.2).all() and measured["chi2"].between(0.5, 2).all()
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((70, 90)),
+        np.full((70, 90), 4321.7),
+        np.full((200, 300), 65535, np.uint16),
+        np.ones((61, 61), np.uint8),
+        np.add.outer(np.arange(100.0), 3 * np.arange(120.0)),
+        np.random.default_rng(1).normal(500, 38, (200, 300)),
+        np.random.default_rng(2).poisson(3, (128, 150)),
+    ],
+    ids=["black", "constant", "saturated", "as large as a template", "ramp", "noise", "counts"],
+)
+def test_joint_of_a_frame_without_particles(calibrations, image):
+    for made in calibrations.values():
+        measured = joint(image, made)
+        assert len(measured) == 0
+        assert_joint_columns(measured)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32, np.float64, ">u2", bool])
+def test_joint_of_any_type(few, calibration, dtype):
+    frame = few[0] // 16
+    if dtype is bool:  # no light, but no error
+        assert_joint_columns(joint(frame > 60_000, calibration))
+        return
+    frame = np.minimum(frame, 255)
+    expected = joint(frame, calibration)
+    assert len(expected) == 4
+    pd.testing.assert_frame_equal(joint(frame.astype(dtype), calibration), expected, check_exact=True)
+
+
+@pytest.mark.parametrize("kind", ["read-only", "Fortran order", "negative strides", "list"])
+def test_joint_of_any_memory_layout(few, calibration, kind):
+    frame = few[0].astype(np.float32)
+    given = {
+        "read-only": frame.copy(),
+        "Fortran order": np.asfortranarray(frame),
+        "negative strides": frame[::-1, ::-1].copy()[::-1, ::-1],
+        "list": frame.tolist(),
+    }[kind]
+    if kind == "read-only":
+        given.flags.writeable = False
+    pd.testing.assert_frame_equal(joint(given, calibration), joint(frame, calibration), check_exact=True)
+    np.testing.assert_array_equal(given, few[0])
+
+
+@pytest.mark.parametrize(("gain", "level"), [(1, 5000), (1, -700), (3, 0), (0.01, 0), (1e4, 1e6)])
+def test_joint_gain_and_level(few, calibration, gain, level):
+    """Neither moves a particle; brightness has the gain."""
+    expected = joint(few[0], calibration)
+    measured = joint(gain * few[0].astype(float) + level, calibration)
+    assert_same(measured, expected, xy_px=0.01, z_um=0.1, cm=1e-3)
+    np.testing.assert_allclose(measured["brightness"], gain * expected["brightness"], rtol=0.01)
+    np.testing.assert_allclose(measured["chi2"], expected["chi2"], rtol=0.05)
+
+
+def test_joint_transposed(few, stacks, calibration):
+    turned = Calibration.from_stack(stacks["fluorescent"].transpose(0, 2, 1), Z_UM)
+    measured = joint(few[0].T, turned).rename(columns={"x_px": "y_px", "y_px": "x_px"})
+    assert_same(measured, joint(few[0], calibration), xy_px=0.02, z_um=0.2, cm=0.01)
+
+
+def test_joint_twice_and_after_another_shape(microscope, few, calibration):
+    expected = joint(few[0], calibration)
+    joint(microscope.render(table(50, 60, 0), (99, 130)), calibration)
+    pd.testing.assert_frame_equal(joint(few[0], calibration), expected, check_exact=True)
+
+
+def test_joint_at_the_ends_of_the_stack(microscope, calibration):
+    """A particle a little beyond is at the end, or, faint as it is on this side, near it."""
+    true = table([50, 150, 250, 350], [60] * 4, [-51.0, -10.0, 20.0, 51.0])
+    measured = joint(microscope.render(true, (120, 400), rng=5), calibration).sort_values("x_px")
+    assert len(match(measured, true)) == 4 == len(measured)
+    assert measured["at_end"].tolist()[:3] == [True, False, False]
+    assert measured["z_um"].iloc[0] == -50 and 49 < measured["z_um"].iloc[3] <= 50
+
+
+@pytest.mark.parametrize("settings", [{"threshold": 0.6}, {"refine": False}, {"min_distance_px": 10}])
+def test_joint_has_no_settings(few, calibration, settings):
+    message = "^threshold, refine, min_distance_px: got one with method 'joint', which has none of them"
+    for call in (locate, lambda frame, *args, **kw: batch([frame], *args, progress=False, **kw)):
+        with pytest.raises(ValueError, match=message):
+            call(few[0], calibration, method="joint", **settings)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"method": "jiont"}, ValueError, "^method: got 'jiont'"),
+        ({"method": None}, (TypeError, ValueError), "^method: got None"),
+        ({"image": with_value(np.nan)}, ValueError, "^image: got NaN or infinity, allowed are finite numbers"),
+        ({"image": with_value(np.inf)}, ValueError, "^image: got NaN or infinity"),
+        ({"image": np.zeros((60, 90))}, ValueError, r"^image: got shape \(60, 90\), allowed is no smaller than a temp"),
+        ({"image": np.zeros((80, 90, 3))}, ValueError, r"^image: got shape \(80, 90, 3\)"),
+        ({"image": None}, TypeError, "^image: got values of type object"),
+        ({"calibration": np.zeros((51, 61, 61))}, TypeError, "^calibration: got a ndarray, allowed is a Calibration"),
+        ({"calibration": None}, TypeError, "^calibration: got a NoneType"),
+    ],
+)
+def test_joint_refuses(calibration, changes, error, message):
+    arguments = {"image": with_value(0), "calibration": calibration, "method": "joint"} | changes
+    with pytest.raises(error, match=message):
+        locate(**arguments)
+    with pytest.raises(error, match=message):
+        batch([arguments.pop("image")], **arguments, progress=False)
+
+
+def test_joint_batch_with_frames_of_many_shapes(microscope, few, calibration):
+    """Each shape begins anew; blank frames have no rows."""
+    other = table([60, 90], [50, 110], [-20, 15])
+    small = microscope.render(other, (150, 140), rng=6)
+    frames = [few[0], small, small, np.zeros((61, 70)), few[0]]
+    measured = batch(frames, calibration, method="joint", progress=False)
+    assert_joint_columns(measured, ["frame"])
+    assert measured.groupby("frame").size().to_dict() == {0: 4, 1: 2, 2: 2, 4: 4}
+    for frame, true in zip((0, 1, 2, 4), (few[1], other, other, few[1]), strict=True):
+        part = measured[measured["frame"] == frame].drop(columns="frame")
+        assert len(match(part, true, within_px=0.3, within_um=3)) == len(true)
+    pd.testing.assert_frame_equal(
+        measured[measured["frame"] == 0].drop(columns="frame"), joint(few[0], calibration), check_exact=True
+    )
+
+
+@pytest.mark.parametrize("frames", [[], iter(()), [np.zeros((61, 61))]])
+def test_joint_batch_of_nothing(calibration, frames):
+    measured = batch(frames, calibration, method="joint", progress=False)
+    assert len(measured) == 0
+    assert_joint_columns(measured, ["frame"])
+
+
+def test_joint_in_any_number_of_processes(few, stacks, monkeypatch):
+    """Blocks begin anew wherever they are measured; a calibration that has worked before is as good as a new one."""
+    monkeypatch.setattr(__import__("sys").modules["gdptlab.locate"], "BLOCK", 3)
+    frames = [few[0][k:, 2 * k :] for k in (0, 0, 1, 1, 1, 2, 2)]
+    worked, new = (Calibration.from_stack(stacks["fluorescent"], Z_UM) for _ in range(2))
+    joint(few[0], worked)
+    one, two = (batch(frames, made, n_jobs=n, progress=False, method="joint") for n, made in ((1, worked), (2, new)))
+    assert one.groupby("frame").size().tolist() == [4] * 7
+    pd.testing.assert_frame_equal(one, two, check_exact=True)
