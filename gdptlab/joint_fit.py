@@ -196,24 +196,25 @@ def _inverse_diagonal(factor):  # pragma: no cover
     """
     width, n = factor.shape
     rows = np.zeros((n, width))  # [j, i]: element (j + i, j) of the inverse
-    column = np.empty(width)
     for j in range(n - 1, -1, -1):
         last = min(width - 1, n - 1 - j)
         pivot = factor[0, j]
+        column, product = np.zeros(last + 1), np.zeros(last + 1)
         for k in range(1, last + 1):
             column[k] = factor[k, j] / pivot
-        for i in range(1, last + 1):
-            total = 0.0
-            for k in range(1, i):
-                total += column[k] * rows[j + k, i - k]
-            near = rows[j + i]
-            for k in range(i, last + 1):
-                total += column[k] * near[k - i]
-            rows[j, i] = -total
+        for k in range(1, last + 1):  # product = inverse @ column, of which half is stored
+            near, c, across = rows[j + k], column[k], 0.0
+            ahead, out = column[k:], product[k:]
+            out[0] += c * near[0]
+            for d in range(1, last - k + 1):
+                out[d] += c * near[d]
+                across += ahead[d] * near[d]
+            out[0] += across
         total = 0.0
         for k in range(1, last + 1):
-            total += column[k] * rows[j, k]
-        rows[j, 0] = 1 / pivot**2 - total
+            rows[j, k] = -product[k]
+            total += column[k] * product[k]
+        rows[j, 0] = 1 / pivot**2 + total
     return rows[:, 0].copy()
 
 
