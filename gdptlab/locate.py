@@ -44,7 +44,7 @@ METHODS = ("correlation", "joint")
 """How `locate` can work."""
 
 ROUNDS = 8
-"""Of the refinement's walk, at most. A particle needs one or two."""
+"""Of the refinement's walk, at most. Most particles need one or two, a few of a crowded frame more."""
 
 BLOCK = 25
 """Consecutive frames that `batch` hands to a process: long against what it costs to hand them over."""

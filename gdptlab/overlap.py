@@ -154,7 +154,18 @@ class Overlap:
             _variance(fit.light, fit.residual, noise),
         )
 
-    def _fitted(self, frame, places, weight, brightness, spread, behind, steps, near=False) -> JointFit:
+    def _fitted(
+        self,
+        frame: NDArray[np.float32],
+        places: NDArray[np.float64],
+        weight: NDArray[np.float32],
+        brightness: float,
+        spread: float,
+        behind: NDArray[np.float32] | None,
+        steps: int,
+        near: bool = False,
+    ) -> JointFit:
+        """All particles and the background at full resolution."""
         return fitted(
             self._shapes,
             frame,

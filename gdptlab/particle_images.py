@@ -101,7 +101,7 @@ class ParticleImages:
         self._nodes = np.ascontiguousarray(nodes.reshape(len(nodes), -1), dtype=np.float32)
         self.reach = _reach(images, noise)
 
-    def boxes(self, places: NDArray, shape: tuple[int, int], wider: int = 0) -> NDArray[np.int64]:
+    def boxes(self, places: NDArray, shape: tuple[int, int]) -> NDArray[np.int64]:
         """Pixels that particles reach in a frame of `shape`, (P, 4) as in `Columns`.
 
         Parameters
@@ -109,11 +109,9 @@ class ParticleImages:
         places : array (P, 4)
             y, x (px), step along the stack, brightness.
         shape : (rows, columns)
-        wider : int
-            Pixels more all round, but only for images cut off by the calibration's own frame.
         """
         nearest = np.clip(np.rint(places[:, 2]).astype(int), 0, self.count - 1)
-        reach = self.reach[nearest] + wider * (self.reach[nearest] >= self.size // 2)
+        reach = self.reach[nearest]
         middle = np.rint(places[:, :2]).astype(int)
         ends = [
             np.clip(middle[:, i] + sign * reach[:, i] + (sign > 0), 0, shape[i]) for i in (0, 1) for sign in (-1, 1)

@@ -139,14 +139,6 @@ def test_a_particle_wholly_outside_has_no_pixel(shapes, place):
     assert not columns.matrix(ones)[:, :4].any()
 
 
-def test_wider_boxes_only_where_the_stack_cuts_the_image(shapes):
-    places = np.array([[45.0, 50.0, k, 1.0] for k in range(51)])
-    plain, wider = (shapes.boxes(places, (90, 100), wider) for wider in (0, 4))
-    cut = np.repeat(shapes.reach == HALF, 2, axis=1)
-    assert cut.any() and not cut.all()
-    np.testing.assert_array_equal(wider - plain, 4 * cut * (-1, 1, -1, 1))
-
-
 # -------------------- sums
 
 
