@@ -323,10 +323,11 @@ class Calibration:
         return Displacement(self.templates, self.z_um)
 
     def correlator(self, shape: tuple[int, int]) -> Correlator:
-        """Plan for correlating frames of this shape with the subset, kept for the next frame."""
-        if shape not in self._plans:
-            self._plans[shape] = Correlator(self.search_templates[self.subset], shape)
-        return self._plans[shape]
+        """Plan for correlating frames of this shape with the subset, kept for this thread's next frame."""
+        return self.plan(Calibration._correlator, shape)
+
+    def _correlator(self, shape: tuple[int, int]) -> Correlator:
+        return Correlator(self.search_templates[self.subset], shape)
 
     def plan(self, make: Callable[[Self, tuple[int, int]], Plan], shape: tuple[int, int]) -> Plan:
         """`make(self, shape)`, a plan for frames of this shape, kept for this thread's next frame."""

@@ -33,7 +33,8 @@ def normalised(images: NDArray) -> NDArray[np.float32]:
 class Correlator:
     """Plan for correlating frames of one shape with a set of templates.
 
-    One Fourier transform of the frame serves all templates, whose own are kept, and so do its local sums.
+    One Fourier transform of the frame serves all templates, whose own are kept, and so do its local sums. The
+    memory it works in is kept too, so a plan serves one thread at a time.
 
     Parameters
     ----------
@@ -44,10 +45,12 @@ class Correlator:
 
     def __init__(self, templates: NDArray, shape: tuple[int, int]) -> None:
         self._n = templates.shape[-1]
-        self._shape = shape
         # Wrapping around spoils only positions at which the template would leave the frame.
         self._padded = tuple(cv2.getOptimalDFTSize(n) for n in shape)
         self._spectra = [cv2.dft(self._pad(t)) for t in normalised(templates)]
+        self._product, self._full = np.empty((2, *self._padded), dtype=np.float32)
+        rows, columns = (m - self._n + 1 for m in shape)
+        self._maps = np.empty((len(templates), rows, columns), dtype=np.float32)
 
     def _pad(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         rows, columns = (p - n for p, n in zip(self._padded, image.shape, strict=True))
@@ -63,18 +66,17 @@ class Correlator:
         Returns
         -------
         float32 array (k, rows - n + 1, columns - n + 1)
-            From -1 to 1; 0 where the image is flat.
+            From -1 to 1; 0 where the image is flat. The next call writes over it.
         """
-        image = image - image.mean(dtype=np.float64).astype(np.float32)
-        n, (rows, columns) = self._n, (m - self._n + 1 for m in self._shape)
+        image = image - np.float32(cv2.mean(image)[0])
         spectrum = cv2.dft(self._pad(image))
-        per_norm = 1 / local_norm(image, n)
-        maps = np.empty((len(self._spectra), rows, columns), dtype=np.float32)
-        for map_, template in zip(maps, self._spectra, strict=True):
-            product = cv2.mulSpectrums(spectrum, template, 0, conjB=True)
-            full = cv2.idft(product, flags=cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
-            np.multiply(full[:rows, :columns], per_norm, out=map_)
-        return maps
+        per_norm = 1 / local_norm(image, self._n)
+        rows, columns = per_norm.shape
+        for map_, template in zip(self._maps, self._spectra, strict=True):
+            cv2.mulSpectrums(spectrum, template, 0, self._product, conjB=True)
+            cv2.idft(self._product, self._full, cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
+            np.multiply(self._full[:rows, :columns], per_norm, out=map_)
+        return self._maps
 
 
 def local_norm(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:
@@ -93,9 +95,10 @@ def local_norm(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     inside = slice(n // 2, image.shape[0] - (n - 1) // 2), slice(n // 2, image.shape[1] - (n - 1) // 2)
     mean = cv2.boxFilter(image, cv2.CV_32F, (n, n))[inside]
     square = cv2.sqrBoxFilter(image, cv2.CV_32F, (n, n))[inside]
-    variance = square - mean**2
-    floor = (FLAT * image.std(dtype=np.float64)) ** 2
-    return np.where(variance > floor, n * np.sqrt(np.maximum(variance, 0)), np.inf).astype(np.float32)
+    variance = square - mean * mean
+    contrast = cv2.meanStdDev(image)[1][0, 0]
+    variance[variance <= (FLAT * contrast) ** 2] = np.inf
+    return n * np.sqrt(variance)
 
 
 def correlate_plainly(image: NDArray, templates: NDArray) -> NDArray[np.float64]:

@@ -4,8 +4,8 @@ By correlation (the paper's section 2):
 
 1. The frame is correlated with the N_sub images of the calibration's subset (Figure 2b).
 2. Candidates are local peaks, in any of the maps, above a threshold.
-3. A candidate's profile is the highest C_m in each map within two pixels of the peak (Figure 2c). Peaks of
-   different maps may lie a pixel apart; reading the profile at one pixel gives z as well, to a few per cent.
+3. A candidate's profile is the C_m of each map at the peak (Figure 2c), each at the top of parabolas through the
+   neighbouring pixels: peaks lie between pixels, and those of different maps up to a pixel apart.
 4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, which is blind
    to the noise that lowers the whole profile; a parabola through the best three gives the part of a step.
 5. Refinement: the candidate's window is correlated with stack images from the guess onward, uphill along z
@@ -42,6 +42,9 @@ STD_COLUMNS = ("x_std_px", "y_std_px", "z_std_um")
 
 METHODS = ("correlation", "joint")
 """How `locate` can work."""
+
+BETWEEN = 0.95
+"""Share of its C_m that a peak between pixels still has at the nearest one, about, at least."""
 
 ROUNDS = 8
 """Of the refinement's walk, at most. Most particles need one or two, a few of a crowded frame more."""
@@ -108,15 +111,17 @@ def locate(
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
         return _overlapping(image, calibration, None)[0]
     image, distance = _checked(image, calibration, threshold, min_distance_px)
-    place, best, step, cm = _candidates(image, calibration, threshold)
+    place, step, cm = _candidates(image, calibration, threshold)
     if refine:
         place, step, cm = _refined(image, calibration, place, step)
-    else:
-        first = _pixels(image, calibration, place)
-        shift = calibration.displacement(_windows(image, first, calibration.size), best)
-        place = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
     kept = _strongest(place, np.where(cm >= threshold, cm, 0), distance)
-    return _table(place[kept], step[kept], cm[kept], calibration)
+    place, step, cm = place[kept], step[kept], cm[kept]
+    if not refine:
+        first = _pixels(image, calibration, place)
+        nearest = np.rint(step).astype(int)
+        shift = calibration.displacement(_windows(image, first, calibration.size), nearest)
+        place = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
+    return _table(place, step, cm, calibration)
 
 
 def _checked(
@@ -129,7 +134,7 @@ def _checked(
     distance = (
         calibration.size / 4 if min_distance_px is None else positive("min_distance_px", min_distance_px, zero=True)
     )
-    return image - image.mean(dtype=np.float64).astype(np.float32), distance
+    return image - np.float32(cv2.mean(image)[0]), distance
 
 
 def _image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
@@ -188,30 +193,29 @@ def _overlapping(
 
 def _candidates(
     image: NDArray[np.float32], calibration: Calibration, threshold: float
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Peaks of the correlation maps: place (y, x) (n, 2), best template of the stack, z in steps of it, C_m."""
-    scale, near = (2, 1) if calibration.half_resolution else (1, 2)
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Peaks of the correlation maps: place (y, x) (n, 2), z in steps of the stack, C_m."""
+    scale = 2 if calibration.half_resolution else 1
     searched = cv2.pyrDown(image) if scale == 2 else image
     maps = calibration.correlator(searched.shape)(searched)
     highest = maps.max(axis=0)
-    peak = (highest >= threshold) & (highest == cv2.dilate(highest, np.ones((5, 5), np.uint8)))
+    peak = (highest >= BETWEEN * threshold) & (highest == cv2.dilate(highest, np.ones((5, 5), np.uint8)))
     # A peak on the rim of a map is the flank of one outside: its place is unknown.
-    peak[:near], peak[-near:], peak[:, :near], peak[:, -near:] = False, False, False, False
-    row, column = np.nonzero(peak)
-    around = np.arange(-near, near + 1)
-    patches = maps[:, row[:, None, None] + around[:, None], column[:, None, None] + around]
-    profile = patches.max(axis=(2, 3)).T
+    peak[[0, -1]] = peak[:, [0, -1]] = False
+    row, column = np.divmod(np.flatnonzero(peak), peak.shape[1])
+    here = maps[:, row, column]
+    sides = [(maps[:, row - i, column - j], maps[:, row + i, column + j]) for i, j in ((1, 0), (0, 1))]
+    profile = (here + sum(_rise(before, here, after) for before, after in sides)).T
 
     likeness = _standardised(profile) @ _standardised(calibration.expected).T
     k = np.clip(likeness.argmax(axis=1), 1, len(calibration) - 2)
     step = k + _vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
 
-    best = profile.argmax(axis=1)
-    up_down = np.stack([maps[best, row + i, column] for i in (-1, 0, 1)], axis=1)
-    left_right = np.stack([maps[best, row, column + i] for i in (-1, 0, 1)], axis=1)
+    best, each = profile.argmax(axis=1), np.arange(len(row))
+    part = [_vertex(np.stack([before, here, after], axis=-1)[best, each]) for before, after in sides]
     middle = calibration.search_templates.shape[-1] // 2
-    place = scale * (np.stack([row + _vertex(up_down), column + _vertex(left_right)], axis=1) + middle)
-    return place, calibration.subset[best], step, profile[np.arange(len(row)), best]
+    place = scale * (np.stack([row, column], axis=1) + np.stack(part, axis=1) + middle)
+    return place, step, profile[each, best]
 
 
 def _pixels(image: NDArray[np.float32], calibration: Calibration, place: NDArray) -> NDArray[np.int64]:
@@ -276,6 +280,14 @@ def _vertex(values: NDArray) -> NDArray:
     bend = before + after - 2 * here
     slope = (after - before) / 2
     return np.clip(np.divide(-slope, bend, out=np.sign(slope) / 2, where=bend < 0), -0.5, 0.5)
+
+
+def _rise(before: NDArray, here: NDArray, after: NDArray) -> NDArray:
+    """How far the parabola through three values, at -1, 0 and 1, rises between them above the middle one."""
+    bend = before + after - 2 * here
+    slope = (after - before) / 2
+    top = np.clip(np.divide(-slope, bend, out=np.zeros_like(bend), where=bend < 0), -1, 1)
+    return slope * top + bend * top**2 / 2
 
 
 def _standardised(profiles: NDArray) -> NDArray:
