@@ -17,7 +17,7 @@ A particle is then measured only if its whole window lies in the frame; nothing 
 template wide. Or jointly (`overlap`): particles may overlap and be cut by the frame's edge.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import islice
 
 import cv2
@@ -327,12 +327,13 @@ def batch(
     calibration : Calibration
     n_jobs : int
         Processes to spread the blocks over; -1 for one per core. The result does not depend on it. They
-        take some seconds to start, once, and stay for the next film.
+        take some seconds to start, once, and stay for the next film. With method "joint" it is 1.
     progress : bool
         Show a progress bar.
     **settings
-        Of `locate`. With method "joint" the frames should follow each other: within a block each begins with
-        the particles of the last, and one that appears is in the table from the next frame on.
+        Of `locate`. With method "joint" the frames should follow each other: each begins with the particles
+        of the last, which keeps them apart where they meet later, and one that appears is in the table from
+        the next frame on.
 
     Returns
     -------
@@ -351,11 +352,17 @@ def batch(
     blank = locate(np.zeros((_size(calibration),) * 2), calibration, **settings)
     total = len(frames) if hasattr(frames, "__len__") else None
     copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
-    blocks = iter(lambda: list(islice(copies, BLOCK)), [])
-    jobs = (delayed(_located)(block, i * BLOCK, calibration, settings) for i, block in enumerate(blocks))
+    if settings.get("method") == "joint":
+        if n_jobs != 1:
+            raise ValueError(f"n_jobs: got {n_jobs}, allowed with method 'joint' is 1: a frame begins with the last")
+        located = _followed(copies, calibration)
+    else:
+        blocks = iter(lambda: list(islice(copies, BLOCK)), [])
+        jobs = (delayed(_located)(block, i * BLOCK, calibration, settings) for i, block in enumerate(blocks))
+        located = Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs)
     tables = [blank.assign(frame=0)]
     with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
-        for count, table in Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs):
+        for count, table in located:
             tables.append(table)
             bar.update(count)
     return pd.concat(tables, ignore_index=True)[["frame", *blank]]
@@ -365,11 +372,13 @@ def _located(
     block: list[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
 ) -> tuple[int, pd.DataFrame]:
     """How many frames are in a block that begins with number `first`, and what is in them."""
-    tables, before = [], None
-    for i, frame in enumerate(block, first):
-        if settings.get("method") == "joint":
-            table, before = on_one_core(_overlapping)(frame, calibration, before)
-        else:
-            table = locate(frame, calibration, **settings)
-        tables.append(table.assign(frame=i))
+    tables = [locate(frame, calibration, **settings).assign(frame=i) for i, frame in enumerate(block, first)]
     return len(block), pd.concat(tables, ignore_index=True)
+
+
+def _followed(frames: Iterable[NDArray], calibration: Calibration) -> Iterator[tuple[int, pd.DataFrame]]:
+    """1, and the table of the joint fit, for each frame of a film."""
+    before = None
+    for i, frame in enumerate(frames):
+        table, before = on_one_core(_overlapping)(frame, calibration, before)
+        yield 1, table.assign(frame=i)

@@ -25,6 +25,9 @@ LEAST_GAIN = 20.0
 """In log-likelihood, of a particle: chi-square of 40 with 4 degrees of freedom, which noise reaches at one place
 in ten million, and a frame has some ten thousand places to be at."""
 
+SHARE = 0.1
+"""Of the gain of a lone particle, that a new one must bring."""
+
 EXPLAINS = 0.5
 """Share of what it would explain alone that a particle must explain beside the others."""
 
@@ -45,22 +48,19 @@ class Stage:
         What is subtracted from frame and images, each blurred over so many widths of a template; 0: nothing.
     whiten : bool
         Take all that is unexplained for noise (see `MatchedFilter`).
-    share : float
-        Of the gain of a lone particle, that a new one must bring.
     rounds : int
         At most.
     """
 
     blur: float
     whiten: bool
-    share: float
     rounds: int
 
 
 STAGES = (
-    Stage(blur=1 / 20, whiten=True, share=0.5, rounds=4),
-    Stage(blur=1 / 8, whiten=False, share=0.5, rounds=3),
-    Stage(blur=0, whiten=False, share=0.3, rounds=3),
+    Stage(blur=1 / 20, whiten=True, rounds=4),
+    Stage(blur=1 / 8, whiten=False, rounds=3),
+    Stage(blur=0, whiten=False, rounds=3),
 )
 
 
@@ -186,7 +186,7 @@ class Overlap:
     def _unexplained(self, fit: JointFit, noise: float, brightness: float) -> NDArray[np.float64]:
         """Places of further particles, at full resolution; some may lie outside the frame."""
         small = self._reduced(fit.residual)
-        new = self._new(small, noise, brightness, whiten=False, share=0.3, outside_px=self._size / 4)
+        new = self._new(small, noise, brightness, whiten=False, outside_px=self._size / 4)
         return new * (self._scale, self._scale, 1, 1)
 
     def _reduced(self, frame: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -194,7 +194,13 @@ class Overlap:
         return cv2.pyrDown(frame) if self._scale == 2 else frame
 
     def _new(
-        self, residual: NDArray, noise: float, brightness: float, *, whiten: bool, share: float, outside_px: float = 0
+        self,
+        residual: NDArray,
+        noise: float,
+        brightness: float,
+        *,
+        whiten: bool,
+        outside_px: float = 0,
     ) -> NDArray[np.float64]:
         """Places of further particles in what others leave, at the resolution of the search."""
         new, _ = self._filter(
@@ -204,7 +210,7 @@ class Overlap:
             spread=0.05 * brightness,
             whiten=whiten,
             least=LEAST_GAIN,
-            share=share,
+            share=SHARE,
             apart_px=self._size / 6 / self._scale,
             outside_px=outside_px / self._scale,
         )
@@ -223,7 +229,7 @@ class Overlap:
                     behind = self._small_surface.fit(small - light, weight)
                 if new is None:
                     rest = small - behind - light
-                    new = self._new(rest, noise, brightness, whiten=stage.whiten, share=stage.share)
+                    new = self._new(rest, noise, brightness, whiten=stage.whiten)
                 found, new = new, None
                 if not len(found):
                     break
@@ -236,12 +242,8 @@ class Overlap:
                     spread=KNOWN * brightness,
                     steps=2,
                 )
-                stays = fit.explains > EXPLAINS
-                places = fit.places[stays]
-                if len(places):
-                    # Where all explain more than they should, they are too faint.
-                    brightness *= 1 + np.median(fit.explains[stays] - 1) / 2
-                    places[:, 3] = brightness
+                places = fit.places[fit.explains > EXPLAINS]
+                places[:, 3] = brightness
                 light = np.zeros_like(small)
                 self._small_shapes[-1].draw(places, small.shape).add_to(light, places[:, 3])
                 if len(found) < 0.05 * len(places):
@@ -258,9 +260,16 @@ class Overlap:
             share=0,
             apart_px=self._size / 6 / self._scale,
         )
+        if not len(places):
+            return places, 1.0
         best = np.argsort(-gain)[: -(-len(gain) // 3)]
-        brightness = float(np.median(places[best, 3])) if len(best) else 1.0
-        places = places[np.abs(np.log(places[:, 3] / brightness)) < np.log(2)]
+        brightness = float(np.median(places[best, 3]))
+        # Where few particles are most of the spectrum, the filter takes them for noise and for faint.
+        weight = np.full(small.shape, (noise / self._scale) ** -2, dtype=np.float32)
+        sharp = _high_passed(small[None], self._blurs[0])[0]
+        fit = fitted(self._small_shapes[0], sharp, places, weight, brightness=brightness, spread=brightness, steps=2)
+        brightness = float(np.median(fit.places[best, 3]))
+        places = fit.places[np.abs(np.log(fit.places[:, 3] / brightness)) < np.log(2)]
         places[:, 3] = brightness
         return places, brightness
 

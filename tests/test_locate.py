@@ -658,12 +658,12 @@ def test_joint_batch_of_nothing(calibration, frames):
     assert_joint_columns(measured, ["frame"])
 
 
-def test_joint_in_any_number_of_processes(few, stacks, monkeypatch):
-    """Blocks begin anew wherever they are measured; a calibration that has worked before is as good as a new one."""
-    monkeypatch.setattr(__import__("sys").modules["gdptlab.locate"], "BLOCK", 3)
+def test_joint_batch_begins_each_frame_with_the_last(few, stacks, calibration):
+    """In one process, therefore; a calibration that has worked before is as good as a new one."""
     frames = [few[0][k:, 2 * k :] for k in (0, 0, 1, 1, 1, 2, 2)]
-    worked, new = (Calibration.from_stack(stacks["fluorescent"], Z_UM) for _ in range(2))
-    joint(few[0], worked)
-    one, two = (batch(frames, made, n_jobs=n, progress=False, method="joint") for n, made in ((1, worked), (2, new)))
+    new = Calibration.from_stack(stacks["fluorescent"], Z_UM)
+    one, two = (batch(frames, made, progress=False, method="joint") for made in (calibration, new))
     assert one.groupby("frame").size().tolist() == [4] * 7
     pd.testing.assert_frame_equal(one, two, check_exact=True)
+    with pytest.raises(ValueError, match=r"^n_jobs: got 2, allowed with method 'joint' is 1"):
+        batch(frames, calibration, n_jobs=2, method="joint")
