@@ -267,7 +267,7 @@ class Overlap:
         # Where few particles are most of the spectrum, the filter takes them for noise and for faint.
         weight = np.full(small.shape, (noise / self._scale) ** -2, dtype=np.float32)
         sharp = _high_passed(small[None], self._blurs[0])[0]
-        fit = fitted(self._small_shapes[0], sharp, places, weight, brightness=brightness, spread=brightness, steps=2)
+        fit = fitted(self._small_shapes[0], sharp, places, weight, brightness=brightness, spread=brightness, steps=4)
         brightness = float(np.median(fit.places[best, 3]))
         places = fit.places[np.abs(np.log(fit.places[:, 3] / brightness)) < np.log(2)]
         places[:, 3] = brightness
