@@ -3,12 +3,17 @@
 As in the standard assessment of R. Barnkob and M. Rossi, Exp. Fluids 61 (2020) 110.
 """
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from gdptlab.check import positive, real_array
+from gdptlab.check import number, positive, real_array
+
+RESAMPLES = 1000
+"""Draws of the bootstrap."""
 
 AXES = {"dx_px": "x_px", "dy_px": "y_px", "dz_um": "z_um"}
 
@@ -134,6 +139,105 @@ def scores_by_z(
     right = np.array([(parts[3] == k).sum() for k in range(len(edges) - 1)])
     table["precision"] = right / table["n_measured"]  # NaN if there are none
     return table
+
+
+def standard_assessment(
+    locator: Callable[[NDArray], pd.DataFrame],
+    frames: Iterable[NDArray],
+    true: pd.DataFrame,
+    *,
+    edges_um: ArrayLike | None = None,
+    within_px: float = 2.0,
+    within_um: float = 10.0,
+    confidence: float = 0.95,
+    rng: np.random.Generator | int = 0,
+) -> pd.DataFrame:
+    """Let any locator measure frames with known particles, and score it, with confidence intervals.
+
+    The intervals are those of the bootstrap over frames: particles of one frame share its noise and each
+    other's light, frames are independent.
+
+    Parameters
+    ----------
+    locator : callable
+        Takes a frame, returns a table with columns `x_px`, `y_px`, `z_um`: `partial(locate,
+        calibration=calibration)`, say, or somebody else's.
+    frames : iterable of arrays (rows, columns)
+        Two or more; ten or more for intervals worth their name.
+    true : DataFrame
+        Columns `frame` (0 for the first), `x_px`, `y_px`, `z_um`.
+    edges_um : array (n + 1,), optional
+        Increasing edges of bins of z, for a row of each; without it there is one row, for all depths.
+    within_px, within_um
+        As in `match`.
+    confidence : float
+        Of the intervals, between 0 and 1.
+    rng : Generator or int
+        Of the bootstrap.
+
+    Returns
+    -------
+    DataFrame
+        The columns of `scores`, and for each but the counts the ends of its interval, as in `recall_low` and
+        `recall_high`. With `edges_um` the index is `z_um`, the middle of the bins.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not of that form, or there are fewer than two frames.
+    """
+    if not callable(locator):
+        raise TypeError(f"locator: got {locator!r}, allowed is a function that takes a frame and returns a table")
+    if "frame" not in true:
+        raise ValueError(f"true: got columns {list(true)}, needed is frame, too")
+    if not 0 < number("confidence", confidence) < 1:
+        raise ValueError(f"confidence: got {confidence}, allowed is above 0 and below 1")
+    tables, allowed = [], {"within_px": within_px, "within_um": within_um}
+    for k, frame in enumerate(frames):
+        measured, here = locator(frame), true[true["frame"] == k].drop(columns="frame")
+        measured = measured.drop(columns="frame", errors="ignore")
+        if edges_um is None:
+            tables.append(scores(measured, here, **allowed).to_frame().T)
+        else:
+            tables.append(scores_by_z(measured, here, edges_um, **allowed).set_index("z_um"))
+    if len(tables) < 2:
+        raise ValueError(f"frames: got {len(tables)}, allowed are two or more")
+    sums = np.stack([_sums(table) for table in tables])
+    drawn = np.random.default_rng(rng).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
+    best, again = _from_sums(sums.sum(axis=0)), _from_sums(np.einsum("rf,fbs->rbs", drawn, sums))
+    tail = (1 - confidence) / 2
+    columns = {}
+    for name, values in best.items():
+        columns[name] = values
+        if not name.startswith("n_"):
+            draws = np.where(np.isfinite(again[name]), again[name], values)  # one may hold no particle
+            columns[f"{name}_low"], columns[f"{name}_high"] = np.quantile(draws, (tail, 1 - tail), axis=0)
+    return pd.DataFrame(columns, index=tables[0].index)
+
+
+def _sums(table: pd.DataFrame) -> NDArray[np.float64]:
+    """What adds up over frames, (rows, 8), of a table of scores."""
+    counts = table[["n_true", "n_measured", "n_matched"]].to_numpy(dtype=float)
+    matched = counts[:, 2]
+    squares = [table[f"sigma_{c[1:]}"] ** 2 * matched for c in AXES]
+    right = table["precision"] * counts[:, 1]
+    more = np.stack([right, *squares, table["bias_z_um"] * matched], axis=1).astype(float)
+    return np.concatenate([counts, np.nan_to_num(more)], axis=1)
+
+
+def _from_sums(sums: NDArray) -> dict[str, NDArray]:
+    """Scores from such sums (..., 8)."""
+    true, measured, matched, right, *squares, error = np.moveaxis(sums, -1, 0)
+    per_true, per_measured, per_matched = (1 / np.where(n > 0, n, np.nan) for n in (true, measured, matched))
+    return {
+        "n_true": true,
+        "n_measured": measured,
+        "n_matched": matched,
+        "recall": matched * per_true,
+        "precision": right * per_measured,
+        **{f"sigma_{c[1:]}": np.sqrt(s * per_matched) for c, s in zip(AXES, squares, strict=True)},
+        "bias_z_um": error * per_matched,
+    }
 
 
 def _summary(pairs: pd.DataFrame, n_true: int, n_measured: int) -> pd.Series:

@@ -693,7 +693,7 @@ def score_curves(
     ----------
     tables : dict of DataFrame
         By name: the index is drawn along x, columns as in `assess.scores`; a column `recall_std`, say, is
-        drawn as error bars.
+        drawn as error bars, or `recall_low` and `recall_high` are.
     x_label : str
         Label, with unit, of the index.
     columns : sequence of str
@@ -711,10 +711,14 @@ def score_curves(
     for panel, column in zip(axes, columns, strict=True):
         for colour, marker, (name, table) in zip(COLOURS, MARKERS, tables.items(), strict=False):
             spread = table.get(f"{column}_std")
+            if f"{column}_low" in table:
+                ends = table[column] - table[f"{column}_low"], table[f"{column}_high"] - table[column]
+                spread = np.maximum(ends, 0)
             panel.errorbar(
                 table.index, table[column], yerr=spread, color=colour, marker=marker, mfc="none", label=name, capsize=2
             )
-        top = max((t[column] + t.get(f"{column}_std", 0)).max() for t in tables.values())
+        ends = (t.get(f"{column}_high", t[column] + t.get(f"{column}_std", 0)) for t in tables.values())
+        top = max(end.max() for end in ends)
         panel.set(xlabel=x_label, ylabel=SCORES[column], xscale="log" if log else "linear")
         ticks = np.unique(np.concatenate([t.index for t in tables.values()]))
         if log:

@@ -114,13 +114,12 @@ class MatchedFilter:
         known = 0.0 if np.isinf(spread) else spread**-2
         gain, bright = (np.zeros((rows + 2 * pad, columns + 2 * pad), np.float32) for _ in range(2))
         best = np.zeros(gain.shape, np.int32)
-        _gain(self._products, cut.astype(np.float32), rows, columns, brightness, known, share, gain, best, bright)
+        margin = int(np.clip(round(pad - outside_px), 0, pad))
+        cut = cut.astype(np.float32)
+        _gain(self._products, cut, rows, columns, margin, brightness, known, share, gain, best, bright)
 
         width = 2 * max(round(apart_px), 1) + 1
         near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
-        margin = int(np.clip(round(pad - outside_px), 0, pad))
-        gain[:margin] = gain[rows + 2 * pad - margin :] = 0
-        gain[:, :margin] = gain[:, columns + 2 * pad - margin :] = 0
         i, j = np.nonzero((gain > least) & (gain == cv2.dilate(gain, near)))
         return np.stack([i - pad, j - pad, self._steps[best[i, j]], bright[i, j]], axis=1).astype(float), gain[i, j]
 
@@ -141,7 +140,7 @@ def _packed(half: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @compiled
-def _gain(products, cut, rows, columns, brightness, known, share, gain, best, bright):  # pragma: no cover
+def _gain(products, cut, rows, columns, margin, brightness, known, share, gain, best, bright):  # pragma: no cover
     """Highest gain over the depths at each place, with the brightness that brings it.
 
     A particle of brightness b changes minus the log-likelihood by b**2 e / 2 - b c + known (b - brightness)**2 / 2;
@@ -156,7 +155,7 @@ def _gain(products, cut, rows, columns, brightness, known, share, gain, best, br
     inverse = np.empty((depths, width), np.float32)
     highest, argument = np.empty(width, np.float32), np.empty(width, np.int32)
     before = (-1, -1)
-    for i in range(height):
+    for i in range(margin, height - margin):
         top, bottom = max(0, 2 * half - i), min(n, rows - i + 2 * half)
         if (top, bottom) != before:
             before = (top, bottom)
@@ -169,13 +168,13 @@ def _gain(products, cut, rows, columns, brightness, known, share, gain, best, br
         argument[:] = 0
         for z in range(depths):
             row, per = products[z, i], inverse[z]
-            for j in range(width):
+            for j in range(margin, width - margin):
                 c = max(row[j] + aim, zero)
                 g = c * c * per[j]
                 better = g > highest[j]
                 highest[j] = g if better else highest[j]
                 argument[j] = z if better else argument[j]
-        for j in range(width):
+        for j in range(margin, width - margin):
             per = inverse[argument[j], j]
             value = half_of * (highest[j] - base)
             gain[i, j] = value if value > half_of * least * (1 / per - known) else zero

@@ -59,7 +59,6 @@ class Stage:
 
 STAGES = (
     Stage(blur=1 / 20, whiten=True, rounds=4),
-    Stage(blur=1 / 8, whiten=False, rounds=3),
     Stage(blur=0, whiten=False, rounds=3),
 )
 
@@ -123,8 +122,10 @@ class Overlap:
             places, behind = fit.places[self._stays(fit, brightness)], fit.behind
             brightness, spread = _brightness(places, brightness, spread)
             variance = _variance(fit.light, fit.residual, noise)
-            if again:
-                places = np.concatenate([places, self._unexplained(fit, noise, brightness)])
+            new = self._unexplained(fit, noise, brightness) if again else []
+            if not len(new):
+                break
+            places = np.concatenate([places, new])
         fit = self._fitted(frame, places, _weight(fit.light, variance), brightness, spread, behind, 3, near=True)
         stays = self._stays(fit, brightness)
         return Explained(fit, stays, fit.places[stays], np.zeros((stays.sum(), 3)), brightness, spread, variance)

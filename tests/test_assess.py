@@ -5,8 +5,7 @@ import pandas as pd
 import pytest
 from conftest import table
 
-from gdptlab import match
-from gdptlab.assess import scores, scores_by_z
+from gdptlab.assess import match, scores, scores_by_z, standard_assessment
 
 
 def pairs_of(measured, true, **settings):
@@ -172,3 +171,86 @@ def test_refuses(changes, error, message):
 def test_refuses_edges(edges):
     with pytest.raises(ValueError, match=r"^edges_um: got "):
         scores_by_z(ONE, ONE, edges)
+
+
+# -------------------- standard assessment
+
+
+def imitation(rng, n_frames, count=30, recall=0.8, false=3, sigma=(0.1, 0.1, 0.5)):
+    """True particles in frames that are their own numbers, and a locator that measures with such errors."""
+    true = pd.DataFrame(rng.uniform((0, 0, -50), (500, 300, 50), (n_frames * count, 3)), columns=NAMES)
+    true["frame"] = np.repeat(np.arange(n_frames), count)
+
+    def locator(frame):
+        here = true.loc[true["frame"] == frame, NAMES]
+        found = here[rng.uniform(size=len(here)) < recall]
+        found = found + rng.normal(0, sigma, found.shape)
+        return pd.concat([found, pd.DataFrame(rng.uniform(600, 900, (false, 3)), columns=NAMES)], ignore_index=True)
+
+    return locator, true
+
+
+NAMES = ["x_px", "y_px", "z_um"]
+
+
+def test_assessment_agrees_with_the_scores():
+    rng = np.random.default_rng(5)
+    locator, true = imitation(rng, 12)
+    tables = [locator(k).assign(frame=k) for k in range(12)]
+    measured = pd.concat(tables, ignore_index=True)
+    edges = np.linspace(-50, 50, 6)
+    found = standard_assessment(lambda k: tables[k], range(12), true)
+    expected = scores(measured, true)
+    np.testing.assert_allclose(found[expected.index].iloc[0], expected)
+    for name in ("recall", "precision", "sigma_x_px", "sigma_y_px", "sigma_z_um", "bias_z_um"):
+        assert found[f"{name}_low"].item() < found[name].item() < found[f"{name}_high"].item()
+    found = standard_assessment(lambda k: tables[k], range(12), true, edges_um=edges)
+    expected = scores_by_z(measured, true, edges).set_index("z_um")
+    pd.testing.assert_frame_equal(found[expected.columns], expected, check_dtype=False)
+
+
+def test_assessment_intervals_hold_the_truth():
+    held, rng = [], np.random.default_rng(6)
+    for seed in range(60):
+        locator, true = imitation(rng, 10, count=8)
+        found = standard_assessment(locator, range(10), true, rng=seed).iloc[0]
+        held.append([found[f"{n}_low"] <= v <= found[f"{n}_high"] for n, v in (("recall", 0.8), ("sigma_z_um", 0.5))])
+    share = np.mean(held, axis=0)
+    print(f"95 % intervals hold recall and sigma_z in {share} of 60")
+    assert ((share > 0.8) & (share <= 1)).all()
+
+
+def test_assessment_of_nothing_found():
+    _, true = imitation(np.random.default_rng(7), 3)
+    nothing = pd.DataFrame({name: np.zeros(0) for name in NAMES})
+    found = standard_assessment(lambda frame: nothing, range(3), true, edges_um=[-50, 0, 50, 99])
+    assert found["recall"].tolist()[:2] == found["recall_high"].tolist()[:2] == [0, 0]
+    assert found.loc[74.5, ["recall", "recall_low", "precision", "sigma_z_um", "bias_z_um_high"]].isna().all()
+
+
+def test_assessment_is_the_same_with_the_same_seed():
+    locator, true = imitation(np.random.default_rng(8), 4)
+    tables = [locator(k) for k in range(4)]
+    one, two, other = (standard_assessment(lambda k: tables[k], range(4), true, rng=s) for s in (1, 1, 2))
+    pd.testing.assert_frame_equal(one, two, check_exact=True)
+    assert one["recall_low"].item() != other["recall_low"].item() or one["sigma_x_px_low"].item() != (
+        other["sigma_x_px_low"].item()
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"locator": 3}, TypeError, r"^locator: got 3, allowed is a function"),
+        ({"frames": [0]}, ValueError, r"^frames: got 1, allowed are two or more"),
+        ({"true": pd.DataFrame({"x_px": [1.0], "y_px": [1.0], "z_um": [1.0]})}, ValueError, "^true: got columns"),
+        ({"confidence": 1}, ValueError, r"^confidence: got 1, allowed is above 0 and below 1"),
+        ({"edges_um": [3, 2]}, ValueError, "^edges_um: got"),
+        ({"within_px": 0}, ValueError, "^within_px: got 0"),
+    ],
+)
+def test_assessment_refuses(changes, error, message):
+    locator, true = imitation(np.random.default_rng(9), 2)
+    arguments = {"locator": locator, "frames": range(2), "true": true} | changes
+    with pytest.raises(error, match=message):
+        standard_assessment(**arguments)
