@@ -43,7 +43,7 @@ def expected_errors(expected: Mapping[str, pd.DataFrame]) -> Figure:
 
 
 @_styled
-def errors_against_bound(expected: pd.DataFrame, measured: Mapping[str, pd.DataFrame], cut: float = 4.0) -> Figure:
+def errors_against_bound(expected: pd.DataFrame, measured: Mapping[str, pd.DataFrame]) -> Figure:
     """Plot measured errors against depth beside the least that is possible.
 
     Parameters
@@ -52,8 +52,6 @@ def errors_against_bound(expected: pd.DataFrame, measured: Mapping[str, pd.DataF
         From `Calibration.expected_error`.
     measured : dict of DataFrame
         By the method's name, from `assess.standard_assessment` with bins of z.
-    cut : float
-        Where the scale ends, in units of the median bound.
 
     Returns
     -------
@@ -62,7 +60,8 @@ def errors_against_bound(expected: pd.DataFrame, measured: Mapping[str, pd.DataF
     """
     figure, [axes] = _panels(3, 10.5, 3.6)
     for panel, (name, (bound, column)) in zip(axes, AXES.items(), strict=True):
-        panel.fill_between(expected["z_um"], 0, expected[bound], color="0.85", label="impossible", lw=0)
+        lowest = expected[bound].min() / 2
+        panel.fill_between(expected["z_um"], lowest, expected[bound], color="0.85", label="impossible", lw=0)
         for i, (label, table) in enumerate(measured.items()):
             ends = table[column] - table[f"{column}_low"], table[f"{column}_high"] - table[column]
             shift = (i - (len(measured) - 1) / 2) * 1.2  # µm, so that bars do not hide each other
@@ -77,7 +76,7 @@ def errors_against_bound(expected: pd.DataFrame, measured: Mapping[str, pd.DataF
                 lw=1,
                 label=label,
             )
-        panel.set(xlabel="z (µm)", ylabel=f"RMS error of {name}", ylim=(0, cut * expected[bound].median()))
+        panel.set(xlabel="z (µm)", ylabel=f"RMS error of {name}", yscale="log", ylim=(lowest, None))
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     return figure
