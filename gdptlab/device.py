@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from gdptlab.channel import Trajectories
 from gdptlab.check import choice, positive
 from gdptlab.film import Film
-from gdptlab.monitor import PROCESSES, Frame, MiddleThird, Monitor, Result, Trigger
+from gdptlab.monitor import Frame, MiddleThird, Monitor, Result, Trigger
+from gdptlab.own_process import PROCESSES
 from gdptlab.replay import fractions, trigger_time
 
 SLOTS = 16
@@ -54,8 +55,11 @@ class Switched(Trajectories):
         """Positions at many times, as `Trajectories.table`."""
         if self.off_s is None:
             return super().table(times_s, border_um=border_um)
-        super().table(np.asarray(times_s)[:0], border_um=border_um)
         t = np.asarray(times_s, dtype=float)
+        if not np.all((t >= 0) & (t <= self.duration_s)):
+            raise ValueError(f"times_s: got {times_s!r}, allowed are 0 to {self.duration_s:g} s")
+        if border_um != np.inf:
+            positive("border_um", border_um, zero=True)
         on_s = np.minimum(t, self.off_s)
         table = super().table(on_s, border_um=np.inf)
         drifting = (t - on_s)[table["frame"]]

@@ -54,7 +54,7 @@ class Logbook:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, most: int = 10_000) -> None:
-        self.written, self.lost, self.problem = 0, 0, ""
+        self.written, self.lost, self.problem, self._appended = 0, 0, "", 0
         self._most = whole("most", most, 1, 2**31)
         self._lines: deque[bytes] = deque()
         self._changed, self._closing = Condition(), False
@@ -67,13 +67,14 @@ class Logbook:
     @property
     def waiting(self) -> int:
         """Lines that are not on the disk yet."""
-        return len(self._lines)
+        return self._appended - self.written - self.lost
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Add one line. NaN and infinity become null."""
         line = json.dumps(_finite(record), separators=(",", ":"), allow_nan=False).encode() + b"\n"
         with self._changed:
             self._lines.append(line)
+            self._appended += 1
             if len(self._lines) > self._most:
                 self._lines.popleft()
                 self.lost += 1

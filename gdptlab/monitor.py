@@ -13,10 +13,7 @@ A thread shares Python's interpreter with whatever else the program does, such a
 All times are those of `time.perf_counter`, which is one clock for all processes of a machine.
 """
 
-import multiprocessing
 import os
-import pickle
-import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from gdptlab.channel import Channel
 from gdptlab.check import choice, positive, real_array, whole
 from gdptlab.logbook import Logbook
+from gdptlab.own_process import as_text
 from gdptlab.replay import fractions
 
 DIGITS = 3
@@ -376,7 +374,7 @@ class Monitor:
                 self._evaluate(self._example)
         except Exception as error:
             self._close()
-            raise RuntimeError(f"the example could not be evaluated: {_text(error)}") from error
+            raise RuntimeError(f"the example could not be evaluated: {as_text(error)}") from error
         self._state, self.started_s = "running", perf_counter()
         self._write({"event": "started", "utc": datetime.now(UTC).isoformat(), "t_s": self.started_s})
         for thread in self._threads:
@@ -472,8 +470,8 @@ class Monitor:
                         self._dropped += 1
         except Exception as error:
             with self._lock:
-                self._error = f"source: {_text(error)}"
-            self._write({"event": "source failed", "error": _text(error), "t_s": perf_counter()})
+                self._error = f"source: {as_text(error)}"
+            self._write({"event": "source failed", "error": as_text(error), "t_s": perf_counter()})
         finally:
             with self._changed:
                 self._ended = True
@@ -507,7 +505,7 @@ class Monitor:
             on = {t.name: t.after(self._on[t.name], share[t.name], len(table)) for t in self._triggers}
             error = ""
         except Exception as caught:
-            table, share, on, error = pd.DataFrame(), {}, self._on, _text(caught)
+            table, share, on, error = pd.DataFrame(), {}, self._on, as_text(caught)
         return Result(
             frame=number,
             t_s=frame.t_s,
@@ -542,7 +540,7 @@ class Monitor:
                     if call is not None:
                         call(result)
                 except Exception as error:
-                    failures.append(f"{trigger.name}: {_text(error)}")
+                    failures.append(f"{trigger.name}: {as_text(error)}")
         done_s = perf_counter()
         plain = {"frame": result.frame, "dropped": result.dropped, "count": len(result.table), "error": result.error}
         row = {"t_s": result.t_s - self.started_s, "decision_s": result.decision_s - self.started_s}
@@ -580,129 +578,3 @@ def _frames(source: Any) -> Iterator[Any]:
 
 def _rate(times_s: list[float]) -> float:
     return (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 else np.nan
-
-
-def _text(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
-
-
-# -------------------- evaluation in a process of its own
-
-PROCESSES = multiprocessing.get_context("spawn")
-"""How processes are started: afresh, on every system. A copy of this one could hold a lock that nobody releases."""
-
-
-class OwnProcess:
-    """Evaluate frames in a process of its own; if it dies, or takes too long, the next frame starts another.
-
-    It takes a second or two to start, and serves one `Monitor` after the other. Use it in a `with` block, or `stop`
-    it; it ends with the program in any case.
-
-    Parameters
-    ----------
-    evaluate : callable
-        image -> DataFrame, that can be pickled: what it consists of comes from modules, not from a notebook.
-    timeout_s : float
-        For one frame.
-
-    Raises
-    ------
-    TypeError
-        If `evaluate` is no function or cannot be pickled.
-    ValueError
-        If the time is not above 0.
-    """
-
-    def __init__(self, evaluate: Callable[[NDArray], pd.DataFrame], *, timeout_s: float = 10.0) -> None:
-        _function("evaluate", evaluate)
-        try:
-            self._pickled = pickle.dumps(evaluate)
-        except Exception as error:
-            raise TypeError(
-                f"evaluate: got {evaluate!r}, which a process of its own cannot be given ({_text(error)}); allowed "
-                "is what comes from modules, not from a notebook's cells"
-            ) from error
-        self._timeout_s = positive("timeout_s", timeout_s)
-        self._process = None
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
-    def start(self) -> None:
-        """Start the process, if it does not run, and wait until it is there.
-
-        Raises
-        ------
-        RuntimeError
-            If it cannot be started.
-        """
-        if self._process is not None:
-            return
-        self._connection, other = PROCESSES.Pipe()
-        self._process = PROCESSES.Process(target=_serve, args=(other, self._pickled), daemon=True)
-        self._process.start()
-        other.close()  # so that either process sees the end of the other
-        self._answer(60.0)
-
-    def __call__(self, image: NDArray) -> pd.DataFrame:
-        """Evaluate a frame there.
-
-        Raises
-        ------
-        RuntimeError
-            With the text of what was raised there, or if it died or took too long.
-        """
-        self.start()
-        try:
-            self._connection.send(image)
-        except OSError:
-            pass  # it is gone, as no answer will tell
-        return self._answer(self._timeout_s)
-
-    def _answer(self, timeout_s: float) -> Any:
-        try:
-            if not self._connection.poll(timeout_s):
-                raise TimeoutError(f"no answer for {timeout_s:g} s")
-            error, table = self._connection.recv()
-        except (EOFError, OSError) as lost:
-            self.stop()
-            raise RuntimeError(
-                f"the evaluating process is lost, {_text(lost)}; the next frame starts another"
-            ) from lost
-        if error:
-            raise RuntimeError(error)
-        return table
-
-    def stop(self) -> None:
-        """End the process, at once."""
-        if self._process is not None:
-            self._connection.close()
-            self._process.kill()
-            self._process.join()
-            self._process.close()
-            self._process = None
-
-
-def _serve(connection: Any, pickled: bytes) -> None:
-    """Evaluate what comes through the connection, until it is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the program that started this one
-    try:
-        evaluate = pickle.loads(pickled)
-    except Exception as error:
-        connection.send((_text(error), None))
-        return
-    connection.send(("", None))
-    try:
-        while True:
-            image = connection.recv()
-            try:
-                answer = "", evaluate(image)
-            except Exception as error:
-                answer = _text(error), None
-            connection.send(answer)
-    except (EOFError, OSError):
-        pass
