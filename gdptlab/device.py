@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from gdptlab.channel import Trajectories
-from gdptlab.check import choice, positive
+from gdptlab.check import choice, positive, whole
 from gdptlab.film import Film
 from gdptlab.monitor import Frame, MiddleThird, Monitor, Result, Trigger
 from gdptlab.own_process import PROCESSES
@@ -127,7 +127,7 @@ class Device:
         self._process.join()
         self._orders.close(), self._bell.close()
 
-    def run(self, film: Film, *, ahead: bool = False) -> None:
+    def run(self, film: Film, *, ahead: int = 0) -> None:
         """Make an experiment ready. With the first `grab` it begins: the sound is on, frames come at the film's rate.
 
         A frame that takes longer to render than the camera allows makes the camera skip the next.
@@ -136,19 +136,20 @@ class Device:
         ----------
         film : Film
             What happens if nobody switches the sound off.
-        ahead : bool
-            Render all frames before the clock starts, for rates that rendering could not keep up with; then
-            switching the sound off changes nothing in them. Half a MB for each.
+        ahead : int
+            Render so many frames before the clock starts, and show these to and fro: for rates that rendering could
+            not keep up with. Switching the sound off then changes nothing in them. 0: render each in its time.
 
         Raises
         ------
         TypeError, ValueError
-            If that is no film, or not of the camera's shape.
+            If that is no film, or not of the camera's shape, or has fewer frames than are to be rendered ahead.
         RuntimeError
             If the process is gone.
         """
         if not isinstance(film, Film):
             raise TypeError(f"film: got a {type(film).__name__}, allowed is a Film")
+        whole("ahead", ahead, 0, len(film))
         if film.shape != self.shape:
             raise ValueError(f"film: got frames of {film.shape}, allowed are {self.shape}")
         self.halt()
@@ -233,7 +234,8 @@ def _camera(orders: Any, bell: Any, shared: _Shared, shape: tuple[int, int]) -> 
     try:
         while True:
             film, ahead = orders.recv()
-            frames = list(film) if ahead else film
+            made = [film[k] for k in range(ahead)]
+            frames = film
             frames[0]  # what is made at first use is there when the clock starts
             orders.send(None)
             orders.recv()
@@ -242,12 +244,13 @@ def _camera(orders: Any, bell: Any, shared: _Shared, shape: tuple[int, int]) -> 
             while i < len(film) and not shared.stopped.value:
                 sleep(max(start_s + i / film.frame_rate_hz - perf_counter(), 0))
                 off_s = shared.off_s.value - start_s
-                if not ahead and off_s >= 0 and frames is film:
+                if off_s >= 0 and frames is film:
                     frames = switched(film, off_s)
-                image = frames[i]
+                shown = ahead - 1 - abs(ahead - 1 - i % max(2 * ahead - 2, 1)) if ahead else i
+                image = made[shown] if ahead else frames[shown]
                 if number - shared.taken.value < SLOTS:
                     _slot(shared.pixels, shape, number)[:] = image
-                    bell.send((i, perf_counter()))
+                    bell.send((shown, perf_counter()))
                     number += 1
                 else:
                     shared.missed.value += 1

@@ -5,6 +5,7 @@ blue, of the width orange, as everywhere.
 """
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from gdptlab.channel import Channel
 from gdptlab.figures import COLOURS, DEPTH, MARKERS, _bare, _grey, _panels, _styled
 from gdptlab.figures_experiment import _COLOUR, _LINES, _limited
-from gdptlab.monitor import Result, Status
+from gdptlab.monitor import Monitor, Result, Status
 
 _FONT = {"family": "monospace", "size": 9}
 
@@ -124,6 +125,29 @@ def _words(status: Status) -> str:
     return "\n".join(lines)
 
 
+def watch_live(monitor: Monitor, *, period_s: float = 1.0, **settings: Any) -> None:
+    """Draw `live_panel` in a notebook, again and again, until the monitor's source has ended.
+
+    Parameters
+    ----------
+    monitor : Monitor
+    period_s : float
+        Pause between two pictures.
+    **settings
+        Of `live_panel`.
+    """
+    from IPython.display import display
+
+    shown, ended = None, False
+    while not ended:
+        ended = monitor.wait(period_s)
+        picture = live_panel(monitor.latest, monitor.recent(), monitor.status(), **settings)
+        if shown is None:
+            shown = display(picture, display_id=True)
+        else:
+            shown.update(picture)
+
+
 @_styled
 def latencies(runs: Mapping[str, pd.DataFrame], limits_ms: Mapping[str, float]) -> Figure:
     """Plot how long after its delivery each frame was decided on, for several runs of a monitor.
@@ -199,4 +223,36 @@ def loop_and_timer(loop: pd.DataFrame, timers: pd.DataFrame, level: float, chose
     right.set(xlabel="setting of the timer (s)", ylabel=f"below {level:.0%} when it goes off (%)", ylim=(-3, 112))
     right.set_yticks(range(0, 101, 25))
     right.legend(fontsize="small", loc="center right")
+    return figure
+
+
+@_styled
+def one_loop(recent: pd.DataFrame, true: pd.DataFrame, off_s: float, level: float, of: str = "w") -> Figure:
+    """Plot one experiment in which the monitor switched the sound off.
+
+    Parameters
+    ----------
+    recent : DataFrame
+        Frames looked at: `t_s` since the sound was switched on, and `share`.
+    true : DataFrame
+        From `device.true_shares`.
+    off_s : float
+        When the sound went off.
+    level : float
+        Share that triggers.
+    of : str
+        'h' or 'w'.
+
+    Returns
+    -------
+    Figure
+    """
+    figure, [[axes]] = _panels(1, 8, 3.2)
+    axes.axvspan(0, off_s, color=_COLOUR[of], alpha=0.1, lw=0)
+    axes.axhline(level, color="black", lw=0.8, ls=":")
+    axes.plot(true["t_s"], true[f"fraction_{of}"], color=_COLOUR[of], lw=1, ls=_LINES[1], label="true")
+    axes.plot(recent["t_s"], recent["share"], "o", color=_COLOUR[of], ms=3, label="measured")
+    axes.annotate(f"sound off at {off_s:.2f} s", (off_s, 0.32), (4, 0), textcoords="offset points")
+    axes.set(xlabel="t (s)", ylabel=f"share of particles in {of}/3", ylim=(0.2, 1.05), xlim=(0, true["t_s"].max()))
+    axes.legend(loc="lower right")
     return figure

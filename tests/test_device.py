@@ -117,16 +117,18 @@ def test_after_the_switch_it_shows_the_film_without_sound(device):
 
 def test_frames_made_ahead_come_at_any_rate(device):
     made = film(5, frame_rate_hz=400.0, duration_s=0.1)
-    device.run(made, ahead=True)
+    device.run(made, ahead=4)
     shown = frames_of(device)
     assert device.missed + len(shown) <= 40 and len(shown) >= SLOTS
+    if device.missed == 0 and len(shown) == 40:
+        assert device.shown[:9] == [0, 1, 2, 3, 2, 1, 0, 1, 2]
     for i, frame in zip(device.shown, shown, strict=True):
         np.testing.assert_array_equal(frame.image, made[i])
 
 
 def test_a_camera_that_nobody_asks_does_not_wait(device):
     made = film(6, frame_rate_hz=400.0, duration_s=0.2)
-    device.run(made, ahead=True)
+    device.run(made, ahead=1)
     device.grab()
     end = time.monotonic() + 60
     while device.missed < 30:
@@ -134,7 +136,7 @@ def test_a_camera_that_nobody_asks_does_not_wait(device):
         time.sleep(0.01)
     shown = frames_of(device)
     assert len(shown) <= 80 - 30 and len(device.shown) == len(shown) + 1
-    np.testing.assert_array_equal(shown[0].image, made[device.shown[1]])
+    np.testing.assert_array_equal(shown[0].image, made[0])
 
 
 def test_one_experiment_after_the_other(device):
@@ -153,6 +155,8 @@ def test_what_it_cannot_show_is_refused(device):
         device.run(3)
     with pytest.raises(ValueError, match=r"film: got frames of \(310, 180\), allowed are \(320, 180\)"):
         device.run(film(shape=(310, 180)))
+    with pytest.raises(ValueError, match="ahead: got 13, allowed are whole numbers from 0 to 12"):
+        device.run(film(), ahead=13)
 
 
 def test_a_device_that_is_gone():

@@ -461,7 +461,7 @@ def test_a_killed_monitor_leaves_a_log_that_can_be_read(tmp_path):
     command = [sys.executable, "-c", ENDLESS, str(path), str(Path(__file__).parent)]
     process = subprocess.Popen(command)
     try:
-        until(lambda: path.exists() and path.stat().st_size > 50_000 or process.poll() is not None)
+        until(lambda: (path.exists() and path.stat().st_size > 50_000) or process.poll() is not None)
         assert process.poll() is None
     finally:
         process.kill()  # -9
@@ -493,7 +493,7 @@ def test_a_process_of_its_own_may_die(tmp_path):
         monitor = through(frames, evaluate, log=tmp_path / "log")
         assert (monitor.status().evaluated, monitor.status().failed) == (2, 2)
         log, _ = read_log(tmp_path / "log")
-        assert "lost the evaluating process, EOFError" in log["error"][1] or "OSError" in log["error"][1]
+        assert "the evaluating process is lost" in log["error"][1]
         assert "no answer for 1 s" in log["error"][3]
     evaluate.stop()  # again does no harm
 
