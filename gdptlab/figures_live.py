@@ -219,8 +219,8 @@ def loop_and_timer(loop: pd.DataFrame, timers: pd.DataFrame, level: float, chose
     right.axhline(100 * (loop["true_share"] < level).mean(), color=COLOURS[0], ls=_LINES[1], label="monitor")
     for i, (name, t) in enumerate(chosen_s.items()):
         right.axvline(t, color=COLOURS[1 + i], ls=_LINES[1 + i], lw=1)
-        right.annotate(name, (t, 103), ha="center", fontsize="small")
-    right.set(xlabel="setting of the timer (s)", ylabel=f"below {level:.0%} when it goes off (%)", ylim=(-3, 112))
+        right.annotate(name, (t, 111), (2, 0), textcoords="offset points", rotation=90, va="top", fontsize="small")
+    right.set(xlabel="setting of the timer (s)", ylabel=f"below {level:.0%} when it goes off (%)", ylim=(-3, 114))
     right.set_yticks(range(0, 101, 25))
     right.legend(fontsize="small", loc="center right")
     return figure

@@ -20,6 +20,7 @@ from gdptlab.replay import Method
 
 AHEAD = 100  # frames rendered before a camera runs
 IN_VIEW = 100.0
+SIZE_PX = 31  # template
 E_AC = 6.0  # J/m³, and in the closed loop within ± 30 % of it
 SEED = 12
 
@@ -31,9 +32,9 @@ def film_of(rate_hz: float, seconds: float, seed: int = SEED, in_view: float = I
     return Film.seeded(seed, **fields)
 
 
-def method_of(film: Film, size: int, n_sub: int, refine: bool = True) -> Method:
+def method_of(film: Film, n_sub: int, refine: bool = True) -> Method:
     """How its frames are evaluated."""
-    calibration = Calibration.from_stack(*film.stack(size=size), n_sub=n_sub)
+    calibration = Calibration.from_stack(*film.stack(size=SIZE_PX), n_sub=n_sub)
     return Method(evaluator=locate, calibration=calibration, settings={"refine": refine})
 
 
@@ -70,7 +71,7 @@ def main() -> None:
 
     with Device() as device:
         film = film_of(25.0, options.seconds)
-        refined = method_of(film, 61, 9)
+        refined = method_of(film, 9)
         with OwnProcess(refined) as apart:
             for where, evaluate in (("in a thread", refined), ("in a process of its own", apart)):
                 status, _ = watched(device, film, evaluate)
@@ -80,7 +81,7 @@ def main() -> None:
                 note(f"{what}: median latency", status.latency_median_ms, "ms", "30")
                 note(f"{what}: 99th percentile", status.latency_p99_ms, "ms", "80")
         fast = film_of(100.0, options.seconds)
-        status, _ = watched(device, fast, method_of(fast, 61, 4, refine=False))
+        status, _ = watched(device, fast, method_of(fast, 4, refine=False))
         what = "100 frames/s, not refined, N_sub = 4"
         note(f"{what}: dropped", 100 * status.dropped / len(fast), "%", "2")
         note(f"{what}: median latency", status.latency_median_ms, "ms", "")
@@ -92,7 +93,7 @@ def main() -> None:
         note(f"{what}: memory rose by", mb, "MB", "flat")
         energies = E_AC * np.random.default_rng(SEED).uniform(0.7, 1.3, options.experiments)
         films = [film_of(25.0, 4.0, SEED + k, 25.0, energy) for k, energy in enumerate(energies.tolist())]
-        method = method_of(films[0], 31, 9)
+        method = method_of(films[0], 9)
         loop = pd.DataFrame([closed_loop(device, film, method) for film in films])
         what = f"loop closed, {options.experiments} samples"
         note(f"{what}: fired", loop["off_s"].notna().sum(), "", f"{options.experiments}")
