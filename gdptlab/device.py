@@ -8,7 +8,7 @@ import os
 import signal
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from threading import Event
+from threading import Event, Lock
 from time import perf_counter, sleep
 from typing import Any, Self
 
@@ -81,7 +81,8 @@ class Device:
     """Channel, sound, microscope and camera, in another process that keeps to the clock.
 
     It is a source for a `Monitor`. One device does one experiment after the other. Use it in a `with` block, or
-    `close` it; it ends with the program in any case.
+    `close` it; it ends with the program in any case. A program that is a file must start it under
+    ``if __name__ == "__main__":``, since the process reads that file, too.
 
     Parameters
     ----------
@@ -111,7 +112,7 @@ class Device:
         self._process.start()
         orders.close(), bell.close()
         self._film: Film | None = None
-        self._running = False
+        self._running, self._run, self._one_at_a_time = False, 0, Lock()
         self.start_s, self.shown = np.nan, []
 
     def __enter__(self) -> Self:
@@ -161,7 +162,7 @@ class Device:
             self._orders.recv()
         except (EOFError, OSError) as error:
             raise RuntimeError("the device's process is gone") from error
-        self._film, self._running, self.shown = film, True, []
+        self._film, self._running, self._run, self.shown = film, True, self._run + 1, []
 
     def halt(self) -> None:
         """End the experiment, if there is one."""
@@ -171,25 +172,28 @@ class Device:
 
     def grab(self) -> Frame | None:
         """The next frame, as soon as there is one; None if the experiment is over."""
-        while self._running:
-            try:
-                if np.isnan(self.start_s):
-                    self._orders.send(None)
-                    self.start_s = self._orders.recv()
-                if not self._bell.poll(0.1):
-                    continue
-                told = self._bell.recv()
-            except (EOFError, OSError):  # the process is gone
-                told = None
-            if told is None:
-                self._running = False
-                break
-            i, t_s = told
-            frame = _slot(self._shared.pixels, self.shape, len(self.shown)).copy()
-            self.shown.append(i)
-            self._shared.taken.value = len(self.shown)
-            return Frame(frame, t_s)
-        return None
+        run = self._run
+        while True:
+            with self._one_at_a_time:  # a monitor that was stopped may still be waiting for its last frame
+                if not self._running or run != self._run:
+                    return None
+                try:
+                    if np.isnan(self.start_s):
+                        self._orders.send(None)
+                        self.start_s = self._orders.recv()
+                    if not self._bell.poll(0.1):
+                        continue
+                    told = self._bell.recv()
+                except (EOFError, OSError):  # the process is gone
+                    told = None
+                if told is None:
+                    self._running = False
+                    return None
+                i, t_s = told
+                frame = _slot(self._shared.pixels, self.shape, len(self.shown)).copy()
+                self.shown.append(i)
+                self._shared.taken.value = len(self.shown)
+                return Frame(frame, t_s)
 
     def switch_off(self, _: object = None) -> None:
         """Switch the sound off, now. What it is given does not matter, so it can be the action of a `Trigger`."""

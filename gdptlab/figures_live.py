@@ -4,6 +4,7 @@ As in `figures`: each takes data and returns a matplotlib Figure. What concerns 
 blue, of the width orange, as everywhere.
 """
 
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -18,6 +19,7 @@ from gdptlab.figures import COLOURS, DEPTH, MARKERS, _bare, _grey, _panels, _sty
 from gdptlab.figures_experiment import _COLOUR, _LINES, _limited
 from gdptlab.monitor import Monitor, Result, Status
 
+_PATIENCE_S = 5e-4  # after which drawing lets the monitor's threads go on; Python's own is ten times as long
 _FONT = {"family": "monospace", "size": 9}
 
 
@@ -138,14 +140,18 @@ def watch_live(monitor: Monitor, *, period_s: float = 1.0, **settings: Any) -> N
     """
     from IPython.display import display
 
-    shown, ended = None, False
-    while not ended:
-        ended = monitor.wait(period_s)
-        picture = live_panel(monitor.latest, monitor.recent(), monitor.status(), **settings)
-        if shown is None:
-            shown = display(picture, display_id=True)
-        else:
-            shown.update(picture)
+    shown, ended, patience_s = None, False, sys.getswitchinterval()
+    sys.setswitchinterval(_PATIENCE_S)
+    try:
+        while not ended:
+            ended = monitor.wait(period_s)
+            picture = live_panel(monitor.latest, monitor.recent(), monitor.status(), **settings)
+            if shown is None:
+                shown = display(picture, display_id=True)
+            else:
+                shown.update(picture)
+    finally:
+        sys.setswitchinterval(patience_s)
 
 
 @_styled

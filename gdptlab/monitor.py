@@ -16,9 +16,9 @@ All times are those of `time.perf_counter`, which is one clock for all processes
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from threading import Condition, Event, Lock, Thread
+from threading import Condition, Event, Lock, Thread, current_thread
 from time import perf_counter, sleep
 from typing import Any, Self
 
@@ -266,8 +266,8 @@ class Status:
     latency_max_ms: float
     waiting_s: float
     count: int
-    share: dict[str, float] = field(default_factory=dict)
-    on: dict[str, bool] = field(default_factory=dict)
+    share: dict[str, float]
+    on: dict[str, bool]
     actions_failed: int
     error: str
     log_written: int
@@ -387,11 +387,14 @@ class Monitor:
     def stop(self, timeout_s: float = 5.0) -> None:
         """Finish the frame under evaluation, if that takes no longer than `timeout_s`, and close the log.
 
-        A source that waits for a frame is left behind waiting: it ends with the program.
+        A source that waits for a frame is left behind waiting: it ends with the program. An action may call this,
+        too; then the log is closed where the `with` block ends, or by another call.
         """
         self._stopping.set()
         with self._changed:
             self._changed.notify_all()
+        if current_thread() is self._threads[1]:
+            return
         if self._state == "running":
             self._finished.wait(timeout_s)
             self._threads[0].join(0.2)  # it is through, unless its source waits
@@ -501,6 +504,8 @@ class Monitor:
             table = self._evaluate(self._checked(frame.image))
             if not isinstance(table, pd.DataFrame):
                 raise TypeError(f"evaluate: got a {type(table).__name__} from it, allowed is a DataFrame")
+            if not table.columns.is_unique:
+                raise ValueError(f"evaluate: got columns {list(table)} from it, allowed are different names")
             share = {t.name: float(t.share(table)) for t in self._triggers}
             on = {t.name: t.after(self._on[t.name], share[t.name], len(table)) for t in self._triggers}
             error = ""

@@ -21,8 +21,9 @@ START_S = 120.0
 class OwnProcess:
     """Evaluate frames in a process of its own; if it dies, or takes too long, the next frame starts another.
 
-    It takes a second or two to start, and serves one `Monitor` after the other. Use it in a `with` block, or `stop`
-    it; it ends with the program in any case.
+    It takes some seconds to start, and serves one `Monitor` after the other. Use it in a `with` block, or `stop`
+    it; it ends with the program in any case. A program that is a file must start it under
+    ``if __name__ == "__main__":``, since the process reads that file, too.
 
     Parameters
     ----------

@@ -230,6 +230,8 @@ def test_the_middle_third_is_that_of_the_replay():
 def fails(frame):
     if frame[0, 0] == 700:
         raise ZeroDivisionError("by design")
+    if frame[0, 0] == 900:
+        return ten(frame).set_axis(["x_px", "x_px"], axis=1)
     return None if frame[0, 0] == 800 else ten(frame)
 
 
@@ -238,6 +240,7 @@ def fails(frame):
     [
         (image(0, 7), "ZeroDivisionError: by design"),
         (image(0, 8), "TypeError: evaluate: got a NoneType"),
+        (image(0, 9), "ValueError: evaluate: got columns ['x_px', 'x_px']"),
         (np.full(SHAPE, np.nan), "ValueError: frame: got NaN"),
         (np.full(SHAPE, np.inf, dtype=np.float32), "ValueError: frame: got NaN or infinity"),
         (np.zeros((3, 4)), "ValueError: frame: got shape (3, 4), allowed is (3, 5)"),
@@ -313,6 +316,13 @@ def test_stop_does_not_wait_for_the_source(tmp_path):
     camera.queue.put(image(0.1))
     time.sleep(0.05)
     assert monitor.status().evaluated == 1
+
+
+def test_an_action_may_stop_the_monitor(tmp_path):
+    with Monitor(Hand(image(0.95)), ten, [trigger(action=lambda r: monitor.stop())], log=tmp_path / "log") as monitor:
+        assert monitor.wait(60)
+        assert monitor.status().state == "stopped"
+    assert read_log(tmp_path / "log")[0]["on_w"].tolist() == [True]
 
 
 def test_stop_counts_the_frame_it_leaves_as_dropped():
@@ -482,7 +492,7 @@ def dies(frame):
         os._exit(3)
     if frame[0, 0] == 800:
         time.sleep(100)
-    return fails(frame) if frame[0, 0] == 900 else ten(frame)
+    return ten(frame)
 
 
 def test_a_process_of_its_own_may_die(tmp_path):
