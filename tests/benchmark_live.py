@@ -51,7 +51,7 @@ def watched(device: Device, film: Film, evaluate: object) -> tuple[Status, float
     thirds = [MiddleThird(of=of, channel=channel, to_channel=film.to_channel) for of in "hw"]
     triggers = [Trigger(name=third.of, share=third, action=str) for third in thirds]
     example, before = film[0], peak_mb()
-    device.run(film, ahead=AHEAD)
+    device.run(film, ahead=min(AHEAD, len(film)))
     with Monitor(device, evaluate, triggers, example=example) as monitor:
         monitor.wait()
     return monitor.status(), peak_mb() - before
