@@ -1,0 +1,557 @@
+"""The loop by hand: a camera that waits for the test, an evaluator that waits for the test. No clock decides."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+import tracemalloc
+from functools import partial
+from pathlib import Path
+from queue import Queue
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from gdptlab import locate, logbook, replay
+from gdptlab.channel import Channel
+from gdptlab.logbook import Logbook, read_log
+from gdptlab.monitor import Frame, MiddleThird, Monitor, Trigger, at_speed
+from gdptlab.own_process import OwnProcess
+
+SHAPE = (3, 5)
+
+
+def image(share, value=0):
+    """A frame that says which share of ten particles is inside."""
+    return np.full(SHAPE, 100 * value + round(10 * share), dtype=np.uint16)
+
+
+def ten(frame):
+    """Evaluator: ten particles, of which some are inside."""
+    inside = np.arange(10) < int(frame[0, 0]) % 100
+    return pd.DataFrame({"x_px": 1.5, "inside": inside})
+
+
+def inside(table):
+    return table["inside"].mean() if len(table) else np.nan
+
+
+def until(condition, timeout_s=120.0):
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "never happened"
+        time.sleep(0.002)
+
+
+class Hand:
+    """Camera that delivers what it is handed."""
+
+    def __init__(self, *frames):
+        self.queue = Queue()
+        for frame in frames:
+            self.queue.put(frame)
+
+    def grab(self):
+        return self.queue.get()
+
+
+class Gate:
+    """Evaluator that lets a frame through when told."""
+
+    def __init__(self, evaluate=ten):
+        self.evaluate, self.open, self.seen = evaluate, threading.Semaphore(0), []
+
+    def __call__(self, frame):
+        self.seen.append(int(frame[0, 0]))
+        assert self.open.acquire(timeout=20)
+        return self.evaluate(frame)
+
+
+def through(frames, evaluate=ten, triggers=(), **settings):
+    """Let a monitor see each frame; no one is dropped, for each waits for the one before."""
+    camera = Hand()
+    with Monitor(camera, evaluate, triggers, **settings) as monitor:
+        for n, frame in enumerate(frames, 1):
+            camera.queue.put(frame)
+            until(lambda n=n: monitor.status().evaluated + monitor.status().failed == n)
+        camera.queue.put(None)
+        assert monitor.wait(20)
+    return monitor
+
+
+def trigger(name="w", calls=None, **settings):
+    calls = [] if calls is None else calls
+    settings = {"share": inside, "action": lambda r: calls.append(("on", r.frame))} | settings
+    return Trigger(name=name, released=lambda r: calls.append(("off", r.frame)), **settings)
+
+
+# -------------------- the newest frame
+
+
+def test_the_newest_frame_wins_and_drops_are_counted(tmp_path):
+    camera, gate = Hand(), Gate()
+    with Monitor(camera, gate, log=tmp_path / "log") as monitor:
+        camera.queue.put(image(0, 0))
+        until(lambda: gate.seen == [0])
+        for k in range(1, 6):
+            camera.queue.put(image(0, k))
+        until(lambda: monitor.status().grabbed == 6)
+        assert monitor.status().dropped == 4 and monitor.status().evaluated == 0
+        gate.open.release(2)
+        until(lambda: monitor.status().evaluated == 2)
+        camera.queue.put(None)
+        assert monitor.wait(20)
+    assert gate.seen == [0, 500]
+    assert monitor.status().state == "ended"
+    assert monitor.recent()["frame"].tolist() == [0, 5] and monitor.recent()["dropped"].tolist() == [0, 4]
+    frames, _ = read_log(tmp_path / "log")
+    assert frames["frame"].tolist() == [0, 5] and frames["dropped"].tolist() == [0, 4]
+
+
+def test_a_source_that_never_waits_takes_no_memory_and_triggers_within_one_evaluation():
+    shape, frames, looks, calls = (400, 600), 600, [], []
+
+    def flood():
+        for k in range(frames):
+            yield np.full(shape, 9 if k >= 311 else 3, dtype=np.uint16)
+
+    def slow(frame):
+        time.sleep(0.02)
+        return ten(frame)
+
+    act = trigger(action=lambda r: calls.append(r.frame))
+    tracemalloc.start()
+    with Monitor(flood(), slow, [act]) as monitor:
+        assert monitor.wait(60)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    status, looks = monitor.status(), monitor.recent()["frame"]
+    assert status.grabbed == frames == status.evaluated + status.dropped
+    assert status.dropped > 0
+    assert peak < 10 * 2 * shape[0] * shape[1]  # bytes: a few frames, not 600
+    assert looks.iloc[-1] == frames - 1  # what comes last is always looked at
+    assert calls == [looks[looks >= 311].iloc[0]]
+
+
+def test_memory_of_a_camera_may_be_used_again():
+    camera, gate, memory = Hand(), Gate(), image(0.3)
+    with Monitor(camera, gate) as monitor:
+        camera.queue.put(memory)
+        until(lambda: gate.seen)
+        memory[:] = 9
+        gate.open.release()
+        until(lambda: monitor.status().evaluated == 1)
+        assert monitor.latest.table["inside"].sum() == 3
+        np.testing.assert_array_equal(monitor.latest.image, image(0.3))
+        camera.queue.put(None)
+
+
+# -------------------- sources
+
+
+def test_any_source_will_do():
+    frames = [image(0, k) for k in range(4)]
+    hand = Hand(*frames, None)
+    for source in (frames, iter(frames), (f for f in frames), Hand(*frames, None), hand.grab, at_speed(frames, 1000)):
+        with Monitor(source, ten) as monitor:
+            assert monitor.wait(20)
+        status = monitor.status()
+        assert (status.grabbed, status.state) == (4, "ended")
+        assert status.evaluated + status.dropped == 4
+        assert monitor.latest.frame == 3 and monitor.latest.image[0, 0] == 300
+
+
+def test_at_speed_hands_out_no_frame_before_its_time():
+    start, times = time.perf_counter(), []
+    for k in at_speed(range(5), 50):
+        times.append(time.perf_counter() - start)
+        assert k == len(times) - 1
+    assert (np.array(times) >= np.arange(5) / 50 - 1e-3).all()
+
+
+def test_a_frame_can_bring_its_own_time():
+    stamp = time.perf_counter() - 100
+    monitor = through([Frame(image(0), stamp)])
+    assert monitor.latest.t_s == stamp
+    assert monitor.latest.latency_ms > 1e5
+    assert monitor.status().latency_median_ms == pytest.approx(monitor.latest.latency_ms)
+
+
+# -------------------- triggers
+
+
+@pytest.mark.parametrize(
+    ("on", "share", "count", "after"),
+    [
+        (False, 0.9, 10, True),
+        (False, 0.89, 10, False),
+        (True, 0.8, 10, True),
+        (True, 0.79, 10, False),
+        (False, 1.0, 4, False),  # too few to tell
+        (True, 0.0, 4, True),
+        (False, np.nan, 10, False),
+        (True, np.nan, 10, True),
+    ],
+)
+def test_a_trigger_has_hysteresis_and_a_least_count(on, share, count, after):
+    assert trigger().after(on, share, count) is after
+
+
+def test_actions_are_called_when_the_state_changes_and_only_then():
+    calls = []
+    act = [trigger("a", calls), trigger("b", [], level=0.5, release=0.5)]
+    shares = [0.1, 0.9, 1.0, 0.8, 0.7, 0.8, 0.9]
+    monitor = through([image(s) for s in shares], triggers=act)
+    assert calls == [("on", 1), ("off", 4), ("on", 6)]
+    recent = monitor.recent()
+    assert recent["on_a"].tolist() == [False, True, True, True, False, False, True]
+    np.testing.assert_allclose(recent["share_a"], shares)
+    assert monitor.status().on == {"a": True, "b": True}
+    assert monitor.status().share == {"a": 0.9, "b": 0.9}
+    assert monitor.latest.changed == ("a",)
+
+
+def test_the_middle_third_is_that_of_the_replay():
+    rng, channel = np.random.default_rng(0), Channel(width_um=90, height_um=60)
+    table = pd.DataFrame({"y": rng.uniform(-45, 45, 40), "z_um": rng.uniform(-30, 30, 40)})
+    expected = replay.fractions(table.rename(columns={"y": "y_um"}).assign(frame=0), [0], channel).iloc[0]
+    for of in "hw":
+        share = MiddleThird(of=of, channel=channel, to_channel=lambda t: t.assign(y_um=t["y"]))
+        assert share(table) == expected[f"fraction_{of}"] > 0.1
+        assert np.isnan(share(table[:0]))
+
+
+# -------------------- what goes wrong
+
+
+def fails(frame):
+    if frame[0, 0] == 700:
+        raise ZeroDivisionError("by design")
+    if frame[0, 0] == 900:
+        return ten(frame).set_axis(["x_px", "x_px"], axis=1)
+    return None if frame[0, 0] == 800 else ten(frame)
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (image(0, 7), "ZeroDivisionError: by design"),
+        (image(0, 8), "TypeError: evaluate: got a NoneType"),
+        (image(0, 9), "ValueError: evaluate: got columns ['x_px', 'x_px']"),
+        (np.full(SHAPE, np.nan), "ValueError: frame: got NaN"),
+        (np.full(SHAPE, np.inf, dtype=np.float32), "ValueError: frame: got NaN or infinity"),
+        (np.zeros((3, 4)), "ValueError: frame: got shape (3, 4), allowed is (3, 5)"),
+        (np.zeros((3, 5, 3)), "ValueError: frame: got float64 of shape (3, 5, 3)"),
+        (np.zeros((0, 0)), "ValueError: frame: got shape (0, 0)"),
+        ("no frame", "ValueError: frame: got <U8 of shape ()"),
+        ([[1, 2], [3]], "ValueError"),
+    ],
+)
+def test_a_frame_that_cannot_be_evaluated_stops_nothing(bad, words, tmp_path):
+    calls = []
+    frames = [image(0.9), bad, image(0.9), bad, image(0.3)]
+    monitor = through(frames, fails, [trigger(calls=calls)], log=tmp_path / "log")
+    status = monitor.status()
+    assert (status.evaluated, status.failed, status.dropped, status.state) == (3, 2, 0, "ended")
+    assert words in status.error
+    assert calls == [("on", 0), ("off", 4)]  # a bad frame changes nothing
+    log, particles = read_log(tmp_path / "log")
+    assert log["frame"].tolist() == [0, 1, 2, 3, 4]
+    assert [words in text for text in log["error"]] == [False, True, False, True, False]
+    assert particles["frame"].unique().tolist() == [0, 2, 4]
+
+
+def test_an_action_that_raises_stops_nothing(tmp_path):
+    calls = []
+
+    def raises(result):
+        raise OSError("valve stuck")
+
+    act = [trigger("a", action=raises), trigger("b", calls)]
+    monitor = through([image(0.1), image(0.9), image(0.95)], triggers=act, log=tmp_path / "log")
+    assert calls == [("on", 1)]  # the others act all the same
+    assert monitor.status().actions_failed == 1 and "valve stuck" in monitor.status().error
+    log, _ = read_log(tmp_path / "log")
+    assert log["action_error"].tolist() == ["", "a: OSError: valve stuck", ""]
+    assert log["on_a"].tolist() == [False, True, True]
+
+
+def test_a_source_may_stall(tmp_path):
+    camera = Hand(image(0.1))
+    with Monitor(camera, ten, log=tmp_path / "log") as monitor:
+        until(lambda: monitor.status().evaluated == 1)
+        until(lambda: monitor.status().waiting_s > 2)
+        assert monitor.status().state == "running"
+        camera.queue.put(image(0.2))
+        until(lambda: monitor.status().evaluated == 2)
+        assert monitor.status().waiting_s < 2
+        camera.queue.put(None)
+        assert monitor.wait(20)
+    assert read_log(tmp_path / "log")[0]["frame"].tolist() == [0, 1]
+
+
+def test_a_source_may_break(tmp_path):
+    def breaks():
+        yield image(0.1)
+        raise RuntimeError("cable pulled")
+
+    with Monitor(breaks(), ten, log=tmp_path / "log") as monitor:
+        assert monitor.wait(20)
+    assert monitor.status().state == "ended"
+    assert monitor.status().error == "source: RuntimeError: cable pulled"
+    assert monitor.status().evaluated == 1
+    assert "cable pulled" in (tmp_path / "log").read_text()
+
+
+def test_stop_does_not_wait_for_the_source(tmp_path):
+    camera = Hand(image(0.1))
+    with Monitor(camera, ten, log=tmp_path / "log") as monitor:
+        until(lambda: monitor.status().evaluated == 1)
+    assert monitor.status().state == "stopped"
+    events = [json.loads(line).get("event") for line in (tmp_path / "log").read_text().splitlines()]
+    assert events == ["started", None, "stopped"]
+    camera.queue.put(image(0.1))
+    time.sleep(0.05)
+    assert monitor.status().evaluated == 1
+
+
+def test_an_action_may_stop_the_monitor(tmp_path):
+    with Monitor(Hand(image(0.95)), ten, [trigger(action=lambda r: monitor.stop())], log=tmp_path / "log") as monitor:
+        assert monitor.wait(60)
+        assert monitor.status().state == "stopped"
+    assert read_log(tmp_path / "log")[0]["on_w"].tolist() == [True]
+
+
+def test_stop_counts_the_frame_it_leaves_as_dropped():
+    camera, gate = Hand(image(0), image(0)), Gate()
+    monitor = Monitor(camera, gate)
+    monitor.start()
+    until(lambda: monitor.status().grabbed == 2 and gate.seen)
+    threading.Timer(0.1, gate.open.release).start()
+    monitor.stop()
+    status = monitor.status()
+    assert (status.grabbed, status.evaluated, status.dropped, status.state) == (2, 1, 1, "stopped")
+
+
+def test_a_monitor_that_has_not_started_can_be_asked_and_starts_once():
+    monitor = Monitor([image(0)], ten, [trigger()])
+    status = monitor.status()
+    assert (status.state, status.grabbed, status.on) == ("ready", 0, {"w": False})
+    assert np.isnan([status.latency_median_ms, status.rate_hz, status.waiting_s]).all()
+    assert monitor.latest is None and monitor.recent().empty
+    with monitor:
+        monitor.wait(20)
+    with pytest.raises(RuntimeError, match="the monitor is ended, and starts only once"):
+        monitor.start()
+
+
+def test_the_example_is_evaluated_first_and_sets_the_shape():
+    seen = []
+    monitor = through([image(0.4)], lambda f: seen.append(f.shape) or ten(f), example=np.zeros(SHAPE))
+    assert seen == [SHAPE, SHAPE]
+    assert monitor.status().evaluated == 1
+    assert through([image(0.4)], example=np.zeros((4, 4))).status().failed == 1
+    with pytest.raises(RuntimeError, match="the example could not be evaluated: ZeroDivisionError: by design"):
+        Monitor([], fails, example=image(0, 7)).start()
+
+
+# -------------------- the log
+
+
+def test_the_log_holds_what_was_seen(tmp_path):
+    path = tmp_path / "log"
+    runs = [through([image(s) for s in (0.2, 0.9)], triggers=[trigger("a")], log=path) for _ in range(2)]
+    log, particles = read_log(path)
+    assert log["run"].tolist() == [0, 0, 1, 1] and log["frame"].tolist() == [0, 1, 0, 1]
+    assert log["share_a"].tolist() == [0.2, 0.9] * 2 and log["on_a"].tolist() == [False, True] * 2
+    assert (log["t_s"] <= log["decision_s"]).all() and (log["decision_s"] <= log["done_s"]).all()
+    assert log["decision_s"].iloc[-1] == runs[1].latest.decision_s
+    assert particles.groupby(["run", "frame"]).size().tolist() == [10] * 4
+    seen = particles.query("run == 1 and frame == 1").drop(columns=["run", "frame"]).reset_index(drop=True)
+    pd.testing.assert_frame_equal(seen, ten(image(0.9)))
+    status = runs[1].status()
+    assert (status.log_written, status.log_waiting, status.log_lost, status.log_problem) == (4, 0, 0, "")
+
+
+def test_the_log_can_leave_particles_out_and_nan_is_null(tmp_path):
+    through([image(0.2)], triggers=[trigger(share=lambda t: np.nan)], log=tmp_path / "log", log_particles=False)
+    assert '"share":{"w":null}' in (tmp_path / "log").read_text()
+    assert read_log(tmp_path / "log")[1].empty
+
+
+def test_a_full_disk_is_reported_and_no_line_is_lost(tmp_path, monkeypatch):
+    full, real = threading.Event(), logbook._write
+
+    def write(file, data):
+        if full.is_set():
+            real(file, data[: len(data) // 2])  # half a line still fits
+            raise OSError(28, "No space left on device")
+        real(file, data)
+
+    monkeypatch.setattr(logbook, "_write", write)
+    monkeypatch.setattr(logbook, "RETRY_S", 0.02)
+    camera = Hand()
+    with Monitor(camera, ten, log=tmp_path / "log") as monitor:
+        for n in range(1, 31):
+            if n == 11:
+                until(lambda: monitor.status().log_written == 11)
+                full.set()
+            if n == 21:
+                until(lambda: "No space left" in monitor.status().log_problem)
+                assert monitor.status().log_waiting > 0
+                full.clear()
+            camera.queue.put(image(0))
+            until(lambda n=n: monitor.status().evaluated == n)
+        camera.queue.put(None)
+        assert monitor.wait(20)
+    assert monitor.status().log_problem == "" and monitor.status().log_lost == 0
+    assert read_log(tmp_path / "log")[0]["frame"].tolist() == list(range(30))
+    for line in (tmp_path / "log").read_text().splitlines():
+        json.loads(line)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a disk that is always full is a device of Linux")
+def test_a_disk_that_stays_full_stops_nothing():
+    monitor = through([image(0)] * 3, log="/dev/full")
+    status = monitor.status()
+    assert status.evaluated == 3
+    assert "No space left" in status.log_problem and status.log_lost == 5 and status.log_written == 0
+
+
+def test_lines_that_cannot_wait_are_counted(tmp_path, monkeypatch):
+    def full(file, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(logbook, "_write", full)
+    log = Logbook(tmp_path / "log", most=5)
+    for k in range(20):
+        log.append({"k": k})
+    until(lambda: log.problem)
+    assert log.waiting <= 5
+    log.close()
+    assert log.lost == 20 and log.written == 0
+
+
+def test_a_torn_line_is_left_out_and_the_next_run_begins_on_its_own(tmp_path):
+    path = tmp_path / "log"
+    through([image(0.1)] * 2, log=path)
+    with path.open("ab") as file:
+        file.write(b'{"frame":2,"t_s":1')
+    assert len(read_log(path)[0]) == 2
+    through([image(0.1)], log=path)
+    assert read_log(path)[0]["run"].tolist() == [0, 0, 1]
+
+
+def test_an_empty_log(tmp_path):
+    (tmp_path / "log").touch()
+    frames, particles = read_log(tmp_path / "log")
+    assert frames.empty and particles.empty
+    with pytest.raises(FileNotFoundError):
+        read_log(tmp_path / "none")
+    with pytest.raises(FileNotFoundError):
+        Monitor([], ten, log=tmp_path / "none" / "log").start()
+
+
+ENDLESS = """
+import sys
+sys.path.insert(0, sys.argv[2])
+import itertools
+from test_monitor import Monitor, image, ten
+
+with Monitor((image(0.5) for _ in itertools.count()), ten, log=sys.argv[1]) as monitor:
+    monitor.wait()
+"""
+
+
+def test_a_killed_monitor_leaves_a_log_that_can_be_read(tmp_path):
+    path = tmp_path / "log"
+    command = [sys.executable, "-c", ENDLESS, str(path), str(Path(__file__).parent)]
+    process = subprocess.Popen(command)
+    try:
+        until(lambda: (path.exists() and path.stat().st_size > 50_000) or process.poll() is not None)
+        assert process.poll() is None
+    finally:
+        process.kill()  # -9
+        process.wait()
+    lines = path.read_bytes().split(b"\n")
+    assert all(json.loads(line) for line in lines[:-1])  # all but the last, at most
+    frames, particles = read_log(path)
+    assert len(frames) > 50 and frames["frame"].is_monotonic_increasing
+    assert (frames["frame"].diff().dropna() - 1 == frames["dropped"][1:]).all()  # none is missing
+    assert len(particles) == 10 * len(frames)
+
+
+# -------------------- a process of its own
+
+
+def dies(frame):
+    if frame[0, 0] == 700:
+        os._exit(3)
+    if frame[0, 0] == 800:
+        time.sleep(100)
+    return ten(frame)
+
+
+def test_a_process_of_its_own_may_die(tmp_path):
+    frames = [image(0.1), image(0, 7), image(0.2), image(0, 8)]
+    with OwnProcess(dies, timeout_s=1.0) as evaluate:
+        first = evaluate(image(0.1))
+        pd.testing.assert_frame_equal(first, ten(image(0.1)))
+        monitor = through(frames, evaluate, log=tmp_path / "log")
+        assert (monitor.status().evaluated, monitor.status().failed) == (2, 2)
+        log, _ = read_log(tmp_path / "log")
+        assert "the evaluating process is lost" in log["error"][1]
+        assert "no answer for 1 s" in log["error"][3]
+    evaluate.stop()  # again does no harm
+
+
+def test_a_process_of_its_own_finds_the_same(few, calibration):
+    frame, _ = few
+    method = replay.Method(evaluator=locate, calibration=calibration)
+    with OwnProcess(method) as evaluate:
+        pd.testing.assert_frame_equal(evaluate(frame), locate(frame, calibration), rtol=1e-9)
+        with pytest.raises(RuntimeError, match=r"ValueError: image: got shape \(5, 5\)"):
+            evaluate(np.zeros((5, 5)))
+        pd.testing.assert_frame_equal(evaluate(frame), locate(frame, calibration), rtol=1e-9)
+
+
+# -------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: Monitor(3, ten), TypeError, "source: got 3"),
+        (lambda: Monitor([], 3), TypeError, "evaluate: got 3"),
+        (lambda: Monitor([], ten, ["w"]), TypeError, r"triggers: got \['w'\]"),
+        (lambda: Monitor([], ten, [trigger(), trigger()]), TypeError, "different names"),
+        (lambda: Monitor([], ten, window=1), ValueError, "window: got 1"),
+        (lambda: Monitor([], ten, example=[1]), ValueError, "example: got shape"),
+        (lambda: trigger(""), TypeError, "name: got ''"),
+        (lambda: trigger(action=None), TypeError, "action: got None"),
+        (lambda: trigger(share=0.9), TypeError, "share: got 0.9"),
+        (lambda: trigger(level=0.5), ValueError, "release: got 0.8, allowed is up to level, 0.5"),
+        (lambda: trigger(level=-1), ValueError, "level: got -1"),
+        (lambda: trigger(least=-1), ValueError, "least: got -1"),
+        (lambda: at_speed([], 0), ValueError, "rate_hz: got 0"),
+        (lambda: OwnProcess(lambda frame: None), TypeError, "allowed is what comes from modules"),
+        (lambda: OwnProcess(3), TypeError, "evaluate: got 3"),
+        (lambda: OwnProcess(ten, timeout_s=0), ValueError, "timeout_s: got 0"),
+        (lambda: Logbook("x", most=0), ValueError, "most: got 0"),
+        (lambda: MiddleThird(of="x", channel=Channel(), to_channel=ten), ValueError, "of: got 'x'"),
+        (lambda: MiddleThird(of="h", channel=3, to_channel=ten), TypeError, "channel: got 3"),
+        (lambda: MiddleThird(of="h", channel=Channel(), to_channel=3), TypeError, "to_channel: got 3"),
+    ],
+)
+def test_bad_input_is_refused(call, error, words):
+    with pytest.raises(error, match=words):
+        call()
+
+
+def test_a_partial_function_is_an_evaluator(few, calibration):
+    frame, particles = few
+    monitor = through([frame], partial(locate, calibration=calibration))
+    assert len(monitor.latest.table) == len(particles)
