@@ -41,6 +41,10 @@ RIDGE = 0.03
 BELIEVED = 1.0
 """Steps by which a particle's height may differ from the focal surface."""
 
+SMOOTH = (1.0, 0.08)
+"""Steps over which patterns are smoothed along z: at least, and as a share of the distance from focus. Where an
+image is wide it changes slowly, but noise differs from step to step and makes depths stick to some of them."""
+
 EVERY = 3
 """Slices from which places are found: neighbouring ones say much the same of them."""
 
@@ -349,7 +353,9 @@ class _Learning:
         held = square[0] + 0.3 * square[0].mean(axis=(1, 2), keepdims=True) + 1e-6
         for a in range(modes):
             matrix[..., a, a] += (RIDGE if a else 1e-3) * held
-        self.patterns += np.moveaxis(np.linalg.solve(matrix, np.moveaxis(right, 0, -1)[..., None])[..., 0], -1, 0)
+        new = np.linalg.solve(matrix, np.moveaxis(right, 0, -1)[..., None])[..., 0]
+        self.patterns += np.moveaxis(new, -1, 0)
+        self.patterns = np.einsum("kl,mlij->mkij", _smoother(count, self.middle), self.patterns).astype(np.float32)
 
     def own_error(self) -> NDArray[np.float64]:
         """Scatter of the depths (steps) that single slices give for their particles, (N,).
@@ -370,6 +376,16 @@ class _Learning:
             scatter.append(np.median(np.abs(off[self.learned])) / 0.6745)
         share = min(FINE**2 * len(self.patterns) / self.learned.sum(), 0.5)
         return np.interp(np.arange(len(self.scan)), slices, uniform_filter1d(scatter, 5, mode="nearest")) / (1 - share)
+
+
+def _smoother(count: int, middle: float) -> NDArray[np.float64]:
+    """Matrix (N, N) that replaces each value by that of a parabola through its neighbours along z."""
+    steps, matrix = np.arange(count), np.empty((count, count))
+    for k in steps:
+        away = (steps - k) / max(SMOOTH[0], SMOOTH[1] * abs(k - middle))
+        trust = np.exp(-(away**2) / 4)
+        matrix[k] = np.linalg.pinv(np.stack([trust, trust * away, trust * away**2], axis=1))[0] * trust
+    return matrix
 
 
 def _add_band(matrix: NDArray, band: NDArray) -> None:

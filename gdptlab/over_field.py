@@ -21,7 +21,7 @@ from gdptlab.field_calibration import MISFIT, PHOTONS, FieldCalibration
 from gdptlab.field_images import FINE, field_terms
 from gdptlab.joint_fit import JointFit, fitted
 from gdptlab.matched_filter import MatchedFilter
-from gdptlab.particle_images import Columns, compiled
+from gdptlab.particle_images import compiled
 
 LEAST_GAIN = 30.0
 """In log-likelihood, of a particle (see `overlap.LEAST_GAIN`); more, as its brightness is free."""
@@ -44,13 +44,16 @@ ASTRAY = np.array([-8.0, -4.0, 0.0, 4.0, 8.0])
 APART_UM = 1.0
 """Depths nearer than this are one."""
 
+PLANE_UM = 1.0
+"""Scatter of depths about a plane, for `decided_by_plane`."""
+
 AMBIGUOUS = 20.0
 """Log-likelihood by which one depth must be better than the other to be believed. The patterns' own errors are
 alike in neighbouring pixels, which the likelihood does not know: it would ask for 3."""
 
 
 @on_one_core
-def locate_over_field(image: ArrayLike, calibration: FieldCalibration, *, one_plane: bool = False) -> pd.DataFrame:
+def locate_over_field(image: ArrayLike, calibration: FieldCalibration) -> pd.DataFrame:
     """Measure x, y and z of every particle in a frame, with a calibration over the field.
 
     Parameters
@@ -58,9 +61,6 @@ def locate_over_field(image: ArrayLike, calibration: FieldCalibration, *, one_pl
     image : array (rows, columns)
         From the camera and the optics of the scan, and of the same shape.
     calibration : FieldCalibration
-    one_plane : bool
-        It is known that all particles lie on one plane, level to a few micrometres. Then what most of them say
-        decides for those of which both sides of focus are possible. Depths are not drawn to the plane otherwise.
 
     Returns
     -------
@@ -68,8 +68,8 @@ def locate_over_field(image: ArrayLike, calibration: FieldCalibration, *, one_pl
         A row for each particle, brightest first. `x_px`, `y_px`, `z_um` as from `locate`, z in the depths of the
         stage; `at_end`; `x_std_px`, `y_std_px`, `z_std_um`, the last with what a particle differs from the
         scan's; `brightness`, 1 for the scan's median; `chi2`; `z_other_um`, the best depth on the other side of focus
-        and `log_ratio`, the logarithm of the likelihood of the first over that of the second (below 0 where the
-        plane decided against it); `ambiguous`, whether that is below `AMBIGUOUS`.
+        and `log_ratio`, the logarithm of the likelihood of the first over that of the second; `ambiguous`, whether that
+        is below `AMBIGUOUS`.
 
     Raises
     ------
@@ -78,16 +78,51 @@ def locate_over_field(image: ArrayLike, calibration: FieldCalibration, *, one_pl
     """
     if not isinstance(calibration, FieldCalibration):
         raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a FieldCalibration")
-    if not isinstance(one_plane, bool):
-        raise TypeError(f"one_plane: got {one_plane!r}, allowed are True and False")
     image = real_array("image", image, 2)
     if min(image.shape) <= 2 * calibration.reach_px:
         raise ValueError(f"image: got shape {image.shape}, allowed is larger than a pattern")
     search = _Search(image, calibration)
     search.find()
-    if one_plane:
-        search.settle_on_plane()
     return search.table()
+
+
+def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
+    """Choose between the two depths of each particle, when it is known that all lie on one level plane.
+
+    The plane is where it makes the depths of all most likely; each particle then takes the one of its two depths that
+    is nearer to it. Nothing else is drawn to the plane.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Of one frame, from `locate_over_field`.
+
+    Returns
+    -------
+    DataFrame
+        The same rows; where the other depth was taken, `z_um` and `z_other_um` are exchanged and `log_ratio` has
+        the other sign. `ambiguous` stays: it says what the images alone can tell.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing.
+    """
+    missing = {"z_um", "z_other_um", "log_ratio"} - set(table)
+    if missing:
+        raise ValueError(f"table: got no column {sorted(missing)}, needed is a table from locate_over_field")
+    depths = table[["z_um", "z_other_um"]].to_numpy()
+    if not len(depths):
+        return table.copy()
+    planes = np.arange(depths.min(), depths.max() + 0.1, 0.1)
+    off = np.minimum((depths - planes[:, None, None]) ** 2 / PLANE_UM**2, 9) / 2
+    off[:, :, 1] += np.clip(table["log_ratio"].to_numpy(), -AMBIGUOUS, AMBIGUOUS)
+    plane = planes[off.min(axis=2).sum(axis=1).argmin()]
+    swap = np.abs(depths[:, 1] - plane) < np.abs(depths[:, 0] - plane)
+    table = table.copy()
+    table["z_um"], table["z_other_um"] = np.where(swap, depths.T[::-1], depths.T)
+    table["log_ratio"] = np.where(swap, -table["log_ratio"], table["log_ratio"])
+    return table
 
 
 class _Search:
@@ -120,20 +155,6 @@ class _Search:
         self._drop()
         self._other_sides(ASTRAY[1:-1])
         self.fit = self._fitted(3)
-
-    def settle_on_plane(self) -> None:
-        """Move each particle to the depth nearer to that of most particles, of its two."""
-        for _ in range(2):
-            other, log_ratio = self._compare(ASTRAY)
-            steps = np.stack([self.places[:, 2], other[:, 2]])
-            trust = np.clip(log_ratio, 0, 100) * (self.places[:, 3] > FAINTEST)
-            # The depth that most agree on, each weighing as much as it is sure.
-            near = np.abs(steps[0][:, None] - steps[0]) < ASTRAY[-1] / 2
-            middle = steps[0][(near @ trust).argmax()]
-            middle = np.median(steps[0][np.abs(steps[0] - middle) < ASTRAY[-1] / 2])
-            wrong = np.abs(steps[1] - middle) < np.abs(steps[0] - middle)
-            self.places[wrong] = other[wrong]
-            self.fit = self._fitted(3)
 
     def table(self) -> pd.DataFrame:
         """What `locate_over_field` returns."""
@@ -189,8 +210,11 @@ class _Search:
         parts = np.array_split(np.argsort(light), 100)[20:]  # in most frames most is dark
         mean = np.array([max(light[part].mean(), 0) for part in parts])
         spread = np.array([(np.median(np.abs(left[part])) / 0.6745) ** 2 for part in parts])
+        spread = np.maximum(spread, 0.1 * self.noise**2)
         terms = np.stack([np.ones_like(mean), mean, mean**2], axis=1)
         self.variance = nnls(terms / spread[:, None], np.ones_like(spread))[0]
+        # What neighbouring pixels share does not show in them one by one: no less than in the scan.
+        self.variance[2] = max(self.variance[2], MISFIT**2)
         self.variance[0] = max(self.variance[0], 0.5 * self.noise**2)
 
     def _new(self, whiten: bool) -> NDArray[np.float64]:
