@@ -244,6 +244,8 @@ class _Search:
     def _compare(self, astray: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The best other place of each particle (P, 4), and the log-likelihood by which it is worse (P,)."""
         places, count = self.places, len(self.places)
+        if not count:
+            return places, np.zeros(0)
         height = field_terms(places[:, 1], places[:, 0], self.frame.shape) @ self.calibration.surface
         mirror = 2 * (self.calibration.middle + height) - places[:, 2]
         start = np.concatenate([places[:, 2:3], mirror[:, None] + astray], axis=1)
@@ -254,6 +256,7 @@ class _Search:
         trials, gain = trials.reshape(count, -1, 4), gain.reshape(count, -1)
         step_um = abs(self.calibration.z_um[1] - self.calibration.z_um[0])
         same = np.abs(trials[:, :, 2] - trials[:, :1, 2]) * step_um < APART_UM
+        same[same.all(axis=1), 1] = False  # one depth only: it is both
         best = np.where(same, -np.inf, gain).argmax(axis=1)
         rows = np.arange(count)
         log_ratio = np.where(same, gain, -np.inf).max(axis=1) - np.where(same, -np.inf, gain)[rows, best]
