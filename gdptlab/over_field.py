@@ -1,0 +1,339 @@
+"""Measure particles whose images change over the field, differ in brightness, and look alike on both sides of focus.
+
+Particles are found one after the other by a matched filter in what the others leave and fitted all at once, as in
+`overlap`, but nothing is known of their brightness, and each is drawn with the pattern of its place. The joint fit
+climbs to the nearest depth only. Without astigmatism there are two, one on either side of focus, so that each
+particle is also fitted from the mirror image of its depth, with the others as they are, and goes where the
+likelihood is higher. The lower of the two is reported as well.
+"""
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import nnls
+from scipy.spatial import KDTree
+
+from gdptlab.background import Background
+from gdptlab.calibration import noise_level
+from gdptlab.check import real_array
+from gdptlab.cores import on_one_core
+from gdptlab.field_calibration import MISFIT, PHOTONS, FieldCalibration
+from gdptlab.field_images import FINE, field_terms
+from gdptlab.joint_fit import JointFit, fitted
+from gdptlab.matched_filter import MatchedFilter
+from gdptlab.particle_images import compiled
+
+LEAST_GAIN = 30.0
+"""In log-likelihood, of a particle (see `overlap.LEAST_GAIN`); more, as its brightness is free."""
+
+EXPLAINS, FAINTEST = 0.3, 0.05
+"""Share of what it would explain alone that a particle must explain beside the others; its least brightness."""
+
+FREE = 1e3
+"""Spread of brightness of which nothing is known."""
+
+ROUNDS = 4
+"""Of searching for more particles."""
+
+CLIMB = 4
+"""Steps of the fits of single particles."""
+
+ASTRAY = np.array([-8.0, -4.0, 0.0, 4.0, 8.0])
+"""Steps by which the mirror image of a depth may be off, when it is not known well yet."""
+
+APART_UM = 1.0
+"""Depths nearer than this are one."""
+
+PLANE_UM = 1.0
+"""Scatter of depths about a plane, for `decided_by_plane`."""
+
+AMBIGUOUS = 20.0
+"""Log-likelihood by which one depth must be better than the other to be believed. The patterns' own errors are
+alike in neighbouring pixels, which the likelihood does not know: it would ask for 3."""
+
+
+@on_one_core
+def locate_over_field(image: ArrayLike, calibration: FieldCalibration) -> pd.DataFrame:
+    """Measure x, y and z of every particle in a frame, with a calibration over the field.
+
+    Parameters
+    ----------
+    image : array (rows, columns)
+        From the camera and the optics of the scan, and of the same shape.
+    calibration : FieldCalibration
+
+    Returns
+    -------
+    DataFrame
+        A row for each particle, brightest first. `x_px`, `y_px`, `z_um` as from `locate`, z in the depths of the
+        stage; `at_end`; `x_std_px`, `y_std_px`, `z_std_um`, the last with what a particle differs from the
+        scan's; `brightness`, 1 for the scan's median; `chi2`; `z_other_um`, the best depth on the other side of focus
+        and `log_ratio`, the logarithm of the likelihood of the first over that of the second; `ambiguous`, whether that
+        is below `AMBIGUOUS`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not of that form, or the image holds NaN or infinity.
+    """
+    if not isinstance(calibration, FieldCalibration):
+        raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a FieldCalibration")
+    image = real_array("image", image, 2)
+    if min(image.shape) <= 2 * calibration.reach_px:
+        raise ValueError(f"image: got shape {image.shape}, allowed is larger than a pattern")
+    search = _Search(image, calibration)
+    search.find()
+    return search.table()
+
+
+def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
+    """Choose between the two depths of each particle, when it is known that all lie on one level plane.
+
+    The plane is where it makes the depths of all most likely; each particle then takes the one of its two depths that
+    is nearer to it. Nothing else is drawn to the plane.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Of one frame, from `locate_over_field`.
+
+    Returns
+    -------
+    DataFrame
+        The same rows; where the other depth was taken, `z_um` and `z_other_um` are exchanged and `log_ratio` has
+        the other sign. `ambiguous` stays: it says what the images alone can tell.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing.
+    """
+    missing = {"z_um", "z_other_um", "log_ratio"} - set(table)
+    if missing:
+        raise ValueError(f"table: got no column {sorted(missing)}, needed is a table from locate_over_field")
+    depths = table[["z_um", "z_other_um"]].to_numpy()
+    if not len(depths):
+        return table.copy()
+    planes = np.arange(depths.min(), depths.max() + 0.1, 0.1)
+    off = np.minimum((depths - planes[:, None, None]) ** 2 / PLANE_UM**2, 9) / 2
+    off[:, :, 1] += np.clip(table["log_ratio"].to_numpy(), -AMBIGUOUS, AMBIGUOUS)
+    plane = planes[off.min(axis=2).sum(axis=1).argmin()]
+    swap = np.abs(depths[:, 1] - plane) < np.abs(depths[:, 0] - plane)
+    table = table.copy()
+    table["z_um"], table["z_other_um"] = np.where(swap, depths.T[::-1], depths.T)
+    table["log_ratio"] = np.where(swap, -table["log_ratio"], table["log_ratio"])
+    return table
+
+
+class _Search:
+    """A frame, and the particles found so far."""
+
+    def __init__(self, frame: NDArray[np.float32], calibration: FieldCalibration) -> None:
+        self.frame, self.calibration, self._images = frame, calibration, calibration.images
+        mean = calibration.patterns[0][:, ::FINE, ::FINE]
+        key = MatchedFilter, frame.shape
+        if key not in calibration._plans:
+            calibration._plans[key] = MatchedFilter(np.ascontiguousarray(mean), frame.shape)
+        self._filter = calibration._plans[key]
+        self._surface = Background(frame.shape, 4 * calibration.reach_px)
+        self.noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame))) or 1.0
+        self.variance = np.array([self.noise**2, PHOTONS, MISFIT**2])
+        self.places = np.zeros((0, 4))
+        self.fit: JointFit = self._fitted(0)
+
+    def find(self) -> None:
+        """Find particles until no more are."""
+        for again in range(ROUNDS):
+            new = self._new(whiten=again < ROUNDS - 1)
+            self.places = np.concatenate([self.places, new])
+            self.fit = self._fitted(4)
+            self._drop()
+            if again:
+                self._learn_variance()
+                self._other_sides(ASTRAY if again == 1 else ASTRAY[1:-1])
+                self.fit = self._fitted(3)
+        self._drop()
+        self._other_sides(ASTRAY[1:-1])
+        self.fit = self._fitted(3)
+
+    def table(self) -> pd.DataFrame:
+        """What `locate_over_field` returns."""
+        z_um, steps = self.calibration.z_um, np.arange(len(self.calibration))
+        other, log_ratio = self._compare(ASTRAY[1:-1])
+        y, x, step, brightness = self.places.T
+        std = self.fit.std * (1, 1, abs(z_um[1] - z_um[0]))
+        table = pd.DataFrame(
+            {
+                "x_px": x,
+                "y_px": y,
+                "z_um": np.interp(step, steps, z_um),
+                "at_end": (step <= 0) | (step >= len(steps) - 1),
+                "x_std_px": std[:, 1],
+                "y_std_px": std[:, 0],
+                "z_std_um": np.hypot(std[:, 2], np.interp(step, steps, self.calibration.own_error_um)),
+                "brightness": brightness,
+                "chi2": self.fit.chi2,
+                "z_other_um": np.interp(other[:, 2], steps, z_um),
+                "log_ratio": log_ratio,
+                "ambiguous": log_ratio < AMBIGUOUS,
+            }
+        )
+        rows, columns = self.frame.shape
+        inside = (x >= -0.5) & (x < columns - 0.5) & (y >= -0.5) & (y < rows - 0.5)
+        return table[inside].sort_values("brightness", ascending=False, ignore_index=True)
+
+    def _fitted(self, steps: int) -> JointFit:
+        """All particles and the background."""
+        light = np.zeros_like(self.frame)
+        self._images.draw(self.places, self.frame.shape).add_to(light, self.places[:, 3])
+        fit = fitted(
+            self._images,
+            self.frame,
+            self.places,
+            self._weight(light),
+            brightness=1.0,
+            spread=FREE,
+            steps=steps,
+            surface=self._surface,
+        )
+        self.places = fit.places
+        return fit
+
+    def _weight(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        level, linear, square = (np.float32(c) for c in self.variance)
+        light = np.maximum(light, 0)
+        return 1 / (level + (linear + square * light) * light)
+
+    def _learn_variance(self) -> None:
+        """Of a pixel's variance: noise, photons, and what grows with the light's square; none below nothing."""
+        light, left = self.fit.light.ravel(), self.fit.residual.ravel()
+        parts = np.array_split(np.argsort(light), 100)[20:]  # in most frames most is dark
+        mean = np.array([max(light[part].mean(), 0) for part in parts])
+        spread = np.array([(np.median(np.abs(left[part])) / 0.6745) ** 2 for part in parts])
+        spread = np.maximum(spread, 0.1 * self.noise**2)
+        terms = np.stack([np.ones_like(mean), mean, mean**2], axis=1)
+        self.variance = nnls(terms / spread[:, None], np.ones_like(spread))[0]
+        # What neighbouring pixels share does not show in them one by one: no less than in the scan.
+        self.variance[2] = max(self.variance[2], MISFIT**2)
+        self.variance[0] = max(self.variance[0], 0.5 * self.noise**2)
+
+    def _new(self, whiten: bool) -> NDArray[np.float64]:
+        """Places of further particles, of which each stands out from all that is near."""
+        # Where there is light, part of what is left is the patterns' own error.
+        left = self.fit.residual * np.sqrt(self._weight(self.fit.light)) * np.float32(self.noise)
+        new, gain = self._filter(left, self.noise, whiten=whiten, least=LEAST_GAIN, share=0, apart_px=4)
+        new, gain = (a[np.argsort(-gain, kind="stable")] for a in (new, gain))
+        keep = []
+        for i, place in enumerate(new[:, :2]):
+            away = np.hypot(*(place - new[keep, :2]).T)
+            if not ((away < 5) | ((away < 8) & (gain[keep] > 2 * gain[i]))).any():
+                keep.append(i)
+        new = new[keep]
+        if len(self.places) and len(new):
+            new = new[KDTree(self.places[:, :2]).query(new[:, :2])[0] > 2]
+        return new
+
+    def _drop(self) -> None:
+        """Without those that explain too little, and those far outside."""
+        centre = (np.array(self.frame.shape) - 1) / 2
+        outside = np.abs(self.places[:, :2] - centre) - centre
+        stays = (self.fit.explains > EXPLAINS) & (self.places[:, 3] > FAINTEST) & (outside.max(axis=1, initial=0) < 10)
+        self.places = self.places[stays]
+        self.fit = self._fitted(1)
+
+    def _compare(self, astray: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The best other place of each particle (P, 4), and the log-likelihood by which it is worse (P,)."""
+        places, count = self.places, len(self.places)
+        if not count:
+            return places, np.zeros(0)
+        height = field_terms(places[:, 1], places[:, 0], self.frame.shape) @ self.calibration.surface
+        mirror = 2 * (self.calibration.middle + height) - places[:, 2]
+        start = np.concatenate([places[:, 2:3], mirror[:, None] + astray], axis=1)
+        trials = np.repeat(places, start.shape[1], axis=0)
+        trials[:, 2] = np.clip(start.ravel(), 0, len(self.calibration) - 1)
+        owner = np.repeat(np.arange(count), start.shape[1])
+        trials, gain = self._climbed(trials, owner)
+        trials, gain = trials.reshape(count, -1, 4), gain.reshape(count, -1)
+        step_um = abs(self.calibration.z_um[1] - self.calibration.z_um[0])
+        same = np.abs(trials[:, :, 2] - trials[:, :1, 2]) * step_um < APART_UM
+        same[same.all(axis=1), 1] = False  # one depth only: it is both
+        best = np.where(same, -np.inf, gain).argmax(axis=1)
+        rows = np.arange(count)
+        log_ratio = np.where(same, gain, -np.inf).max(axis=1) - np.where(same, -np.inf, gain)[rows, best]
+        return trials[rows, best], log_ratio
+
+    def _other_sides(self, astray: NDArray[np.float64]) -> None:
+        """Move particles to the other side of focus where that is likelier."""
+        other, log_ratio = self._compare(astray)
+        self.places = np.where(log_ratio[:, None] < 0, other, self.places)
+
+    def _climbed(
+        self, trials: NDArray[np.float64], owner: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Fit particles alone, the others as they are, from `trials` (n, 4), each in the stead of one `owner`."""
+        fit, count = self.fit, len(self._images.reach)
+        own = self._images.draw(self.places, self.frame.shape)
+        for step in range(CLIMB + 1):
+            columns = self._images.draw(trials, self.frame.shape)
+            sums = np.zeros((len(trials), 15))
+            _local(
+                fit.residual, fit.light, self.places[:, 3], owner, trials[:, 3], self.variance,
+                own.boxes, own.starts, own.values, columns.boxes, columns.starts, columns.values, sums,
+            )  # fmt: skip
+            if step == CLIMB:
+                return trials, sums[:, 14]
+            matrix = np.empty((len(trials), 4, 4))
+            upper = np.triu_indices(4)
+            matrix[:, upper[0], upper[1]] = matrix[:, upper[1], upper[0]] = sums[:, :10]
+            diagonal = np.arange(4)
+            matrix[:, diagonal, diagonal] = 1.01 * matrix[:, diagonal, diagonal] + 1e-9
+            change = np.linalg.solve(matrix, sums[:, 10:14, None])[..., 0]
+            longest = np.stack([np.full(len(trials), s) for s in (1, 1, 3)] + [0.5 * trials[:, 3]], axis=1)
+            change /= np.maximum((np.abs(change) / longest).max(axis=1, keepdims=True), 1)
+            trials = trials + change
+            trials[:, 2] = np.clip(trials[:, 2], 0, count - 1)
+            trials[:, 3] = np.maximum(trials[:, 3], 0.02)
+        raise AssertionError
+
+
+@compiled
+def _local(
+    left, light, brightness, owner, trial, variance, boxes, starts, values, t_boxes, t_starts, t_values, sums
+):  # pragma: no cover
+    """Sums over the pixels of each trial: upper triangle of its matrix (10), gradient (4), gain in log-likelihood.
+
+    A trial stands in the stead of its owner, whose light goes back into what is left. Each pixel's variance is that
+    of the light of all others and of the trial.
+    """
+    v0, v1, v2 = np.float32(variance[0]), np.float32(variance[1]), np.float32(variance[2])
+    zero = np.float32(0)
+    column = np.empty(4, np.float32)
+    for i in range(len(t_boxes)):
+        o, total = owner[i], 0.0
+        mine, bright = np.float32(brightness[o]), np.float32(trial[i])
+        y0, y1, x0, x1 = t_boxes[i]
+        a0, a1, b0, b1 = boxes[o]
+        for r in range(y0, y1):
+            for c in range(x0, x1):
+                s = t_starts[i] + (r - y0) * (x1 - x0) + c - x0
+                seen, others = left[r, c], light[r, c]
+                if a0 <= r < a1 and b0 <= c < b1:
+                    back = mine * values[3, starts[o] + (r - a0) * (b1 - b0) + c - b0]
+                    seen += back
+                    others -= back
+                others = max(others, zero)
+                before = v0 + (v1 + v2 * others) * others
+                image = bright * t_values[3, s]
+                others += max(image, zero)
+                after = v0 + (v1 + v2 * others) * others
+                rest = seen - image
+                total += seen * seen / before - rest * rest / after + np.log(before / after)
+                q = 0
+                for a in range(4):
+                    column[a] = t_values[a, s]
+                for a in range(4):
+                    for b in range(a, 4):
+                        sums[i, q] += column[a] * column[b] / after
+                        q += 1
+                    sums[i, 10 + a] += column[a] * rest / after
+        sums[i, 14] = total / 2
