@@ -3,11 +3,12 @@
 A particle's path across the channel has a closed form (`Focusing.path`) with two unknowns: where the particle was, which
 is its own, and the rate 2πU/w, which is everybody's. Both are fitted to all tracks at once, along y and along z.
 
-Three things make errors larger than the standard deviations of positions say, and each has its remedy here. A few
-measurements are far off: residuals are taken to have the distribution of Student's t with `FREEDOM` degrees of
-freedom, in which those weigh little. Errors of one track are alike (a neighbour stays a neighbour), and so are
-those of all particles at one depth (they share the calibration): the interval comes from how much the result owes to
-each track, and to each slice of depth, not from the number of rows.
+Errors are larger than the standard deviations of positions say, and there is a remedy for each reason. A crowd closes
+in: in each second of the film all are enlarged by one factor, so that the middle half of the residuals is as it should
+be. A few measurements are far off: residuals are taken to have the distribution of Student's t with `FREEDOM` degrees
+of freedom, in which those weigh little. Errors of one track are alike (a neighbour stays a neighbour), and so are those
+of all particles at one depth (they share the calibration): the interval comes from how much the result owes to each
+track, and to each slice of depth, not from the number of rows.
 """
 
 from dataclasses import dataclass
@@ -16,10 +17,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.spatial import KDTree
 
 from gdptlab.channel import Focusing
 from gdptlab.check import positive
-from gdptlab.tracks import _need
+from gdptlab.film import Film
+from gdptlab.tracks import POSITION, _need, identify
 
 FREEDOM = 4.0
 """Of Student's t: at 5 standard deviations a residual weighs a sixth of what it would otherwise."""
@@ -135,6 +138,7 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
 
     rows = total(np.ones(len(tracks)))
     t = tracks["frame"].to_numpy() / frame_rate_hz
+    second = np.floor(t)
     t = t - (total(t) / rows)[track]
     middle, log_ratio = total(place) / rows, 0.0
     for _ in range(_ROUNDS):
@@ -145,10 +149,10 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
         swing = np.sin(2 * np.pi * path / extent)
         by_middle = swing / np.sin(2 * np.pi * middle / extent)[track]
         by_log = -rate * t * extent / (2 * np.pi) * swing
-        off = (place - path) / std
-        scale = max(1.4826 * np.median(np.abs(off)), 1e-9)  # all, or nearly all, standard deviations may be too small
-        square = (off / scale) ** 2
-        weight = (FREEDOM + 1) / (FREEDOM + square) / std**2
+        off = pd.Series(np.abs(place - path) / std)
+        noise = std * np.maximum(1.4826 * off.groupby(second).transform("median").to_numpy(), 1e-9)
+        square = ((place - path) / noise) ** 2
+        weight = (FREEDOM + 1) / (FREEDOM + square) / noise**2
         own = total(weight * by_middle**2)
         alone = by_log - (total(weight * by_middle * by_log) / own)[track] * by_middle  # what no `middle` can do
         pull = weight * alone * (place - path)
@@ -163,9 +167,54 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
     else:
         raise ValueError(f"tracks: got some whose motion along {axis} fits no rate, allowed are those of sound")
     # How fast the pull falls as the rate rises; less than `information`, for far residuals lose weight meanwhile.
-    stiffness = total((FREEDOM + 1) * (FREEDOM - square) / (FREEDOM + square) ** 2 / std**2 * alone**2)
+    stiffness = total((FREEDOM + 1) * (FREEDOM - square) / (FREEDOM + square) ** 2 / noise**2 * alone**2)
     slices = pd.factorize(np.floor(tracks["z_um"].to_numpy() / SLICE_UM))[0]
     # Of tracks the jackknife: by how much the result would change without this one.
     return _Rate(
         log_ratio, total(pull) / (stiffness.sum() - stiffness), np.bincount(slices, pull) / stiffness.sum()
     )
+
+
+def imitate(tracks: pd.DataFrame, film: Film, other: Film, rng: int | np.random.Generator) -> pd.DataFrame:
+    """Tracks as another film would give them, without measuring it: its true paths with the errors made in this one.
+
+    Each particle of the other film borrows all from one of this film, of the three that began nearest to it in the
+    cross-section: errors, standard deviations, frames in which it was missed, breaks of its track, the
+    stretch in which its track ran on along somebody else. So errors stay as far off, as lasting and as typical of a
+    depth and a time as they were. Tracks of nobody stay where they are.
+
+    Parameters
+    ----------
+    tracks : DataFrame
+        From `link`, measured in `film`: `frame`, `particle`, positions in px and µm, and standard deviations in µm.
+    film, other : Film
+        Of the same length, frame rate and view; about as many particles.
+    rng : int or numpy.random.Generator
+
+    Returns
+    -------
+    DataFrame
+        `frame`, `particle`, and positions and standard deviations in µm.
+    """
+    stds = [f"{axis}_std_um" for axis in "xyz"]
+    _need("tracks", tracks, ["frame", "particle", "x_px", "y_px", *POSITION, *stds])
+    rng = np.random.default_rng(rng)
+    here, there = (f.to_channel(f.truth())[["frame", "particle", *POSITION]] for f in (film, other))
+    who = pd.Series(identify(tracks, film.truth()))
+    owner = who.groupby(tracks["particle"].to_numpy()).agg(lambda part: part.mode().iloc[0])
+    lent = tracks.rename(columns={"particle": "track"})[["frame", "track", *POSITION, *stds]]
+    lent["lender"] = lent["track"].map(owner)
+    nobodys = lent[lent["lender"] < 0].assign(particle=-1)
+    lent = lent.merge(here.rename(columns={"particle": "lender"}), on=["frame", "lender"], suffixes=("", "_true"))
+    start = {f: f.trajectories.start.set_index("particle")[["y_um", "z_um"]] for f in (film, other)}
+    lenders = start[film].loc[np.unique(lent["lender"])]
+    borrowers = start[other].loc[there["particle"].unique()]
+    near = KDTree(lenders).query(borrowers, k=3)[1]
+    chosen = lenders.index.to_numpy()[rng.permuted(near, axis=1)[:, 0]]
+    there["lender"] = there["particle"].map(dict(zip(borrowers.index, chosen, strict=True)))
+    made = there.merge(lent, on=["frame", "lender"], suffixes=("", "_lent"))
+    for name in POSITION:
+        made[name] += made[f"{name}_lent"] - made[f"{name}_true"]
+    made = pd.concat([made, nobodys], ignore_index=True)
+    made["particle"] = made.groupby(["particle", "track"]).ngroup()
+    return made[["frame", "particle", *POSITION, *stds]].sort_values(["frame", "particle"], ignore_index=True)

@@ -202,6 +202,40 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float, *, window: int = 11) 
 # -------------------- against the truth
 
 
+def identify(
+    tracks: pd.DataFrame, true: pd.DataFrame, *, within_px: float = 2.0, within_um: float = 10.0
+) -> NDArray[np.int64]:
+    """Which true particle is each measured one?
+
+    Parameters
+    ----------
+    tracks : DataFrame
+        Measured, linked or not: `frame`, `x_px`, `y_px`, `z_um`.
+    true : DataFrame
+        As from `Film.truth`: `frame`, `particle` (0 or above), `x_px`, `y_px`, `z_um`.
+    within_px, within_um : float
+        As in `assess.match`, which decides. Where true particles are nearer to each other than this, it does so by
+        their distance alone, and sound brings them there.
+
+    Returns
+    -------
+    array (n,)
+        Number of the true particle of each row; -1: of none.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing or a tolerance is not above 0.
+    """
+    _need("tracks", tracks, ["frame", "x_px", "y_px", "z_um"])
+    _need("true", true, ["frame", "particle", "x_px", "y_px", "z_um"])
+    tracks, true = tracks.reset_index(drop=True), true.reset_index(drop=True)
+    pair = match(tracks, true, within_px=within_px, within_um=within_um)
+    who = np.full(len(tracks), -1)
+    who[pair["measured"]] = true["particle"].to_numpy()[pair["true"]]
+    return who
+
+
 def link_scores(
     tracks: pd.DataFrame, true: pd.DataFrame, *, within_px: float = 2.0, within_um: float = 10.0
 ) -> pd.Series:
@@ -211,11 +245,8 @@ def link_scores(
     ----------
     tracks : DataFrame
         From `link`, with `x_px`, `y_px`, `z_um`; of all frames of `true`, or of some of both.
-    true : DataFrame
-        As from `Film.truth`: `frame`, `particle`, `x_px`, `y_px`, `z_um`.
-    within_px, within_um : float
-        As in `assess.match`, which says whom a measured particle is. Where true particles are nearer to each
-        other than this, it says so by their distance alone, and sound brings them there.
+    true, within_px, within_um
+        As in `identify`.
 
     Returns
     -------
@@ -231,21 +262,16 @@ def link_scores(
     ValueError
         If a column is missing or a tolerance is not above 0.
     """
-    _need("tracks", tracks, ["frame", "particle", "x_px", "y_px", "z_um"])
-    _need("true", true, ["frame", "particle", "x_px", "y_px", "z_um"])
-    tracks, true = tracks.reset_index(drop=True), true.reset_index(drop=True)
-    pair = match(tracks, true, within_px=within_px, within_um=within_um)
-    who = pd.Series(-1, index=tracks.index)
-    who[pair["measured"]] = true["particle"].loc[pair["true"]].to_numpy()
-    ordered = tracks.assign(who=who).sort_values(["particle", "frame"], kind="stable")
+    _need("tracks", tracks, ["particle"])
+    who = identify(tracks, true, within_px=within_px, within_um=within_um)
+    ordered = tracks.assign(who=who).sort_values(["particle", "frame"])
     after = ordered.shift(-1)
     linked = (ordered["particle"] == after["particle"]).to_numpy()
     here, there = ordered["who"].to_numpy()[linked], after["who"].to_numpy()[linked]
     gap = (after["frame"] - ordered["frame"]).to_numpy()[linked] > 1
     known = (here >= 0) & (there >= 0)
     right = known & (here == there)
-    somebody = ordered[ordered["who"] >= 0]
-    pieces = somebody.groupby("who")["particle"].nunique()
+    pieces = ordered[ordered["who"] >= 0].groupby("who")["particle"].nunique()
     possible = len(true) - true["particle"].nunique()
     return pd.Series(
         {
