@@ -11,6 +11,7 @@ of all particles at one depth (they share the calibration): the interval comes f
 track, and to each slice of depth, not from the number of rows.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,10 +176,12 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
     )
 
 
-def imitate(tracks: pd.DataFrame, film: Film, other: Film, rng: int | np.random.Generator) -> pd.DataFrame:
-    """Tracks as another film would give them, without measuring it: its true paths with the errors made in this one.
+def imitate(
+    tracks: pd.DataFrame, film: Film, others: Iterable[Film], rng: int | np.random.Generator
+) -> Iterator[pd.DataFrame]:
+    """Tracks as other films would give them, without measuring those: their true paths with the errors made in this one.
 
-    Each particle of the other film borrows all from one of this film, of the three that began nearest to it in the
+    Each particle of another film borrows all from one of this film, of the three that began nearest to it in the
     cross-section: errors, standard deviations, frames in which it was missed, breaks of its track, the
     stretch in which its track ran on along somebody else. So errors stay as far off, as lasting and as typical of a
     depth and a time as they were. Tracks of nobody stay where they are.
@@ -187,34 +190,45 @@ def imitate(tracks: pd.DataFrame, film: Film, other: Film, rng: int | np.random.
     ----------
     tracks : DataFrame
         From `link`, measured in `film`: `frame`, `particle`, positions in px and µm, and standard deviations in µm.
-    film, other : Film
-        Of the same length, frame rate and view; about as many particles.
+    film : Film
+    others : iterable of Film
+        Of the same length, frame rate and view as `film`; about as many particles.
     rng : int or numpy.random.Generator
 
-    Returns
-    -------
+    Yields
+    ------
     DataFrame
         `frame`, `particle`, and positions and standard deviations in µm.
     """
     stds = [f"{axis}_std_um" for axis in "xyz"]
     _need("tracks", tracks, ["frame", "particle", "x_px", "y_px", *POSITION, *stds])
     rng = np.random.default_rng(rng)
-    here, there = (f.to_channel(f.truth())[["frame", "particle", *POSITION]] for f in (film, other))
+    here, start = _paths(film)
     who = pd.Series(identify(tracks, film.truth()))
     owner = who.groupby(tracks["particle"].to_numpy()).agg(lambda part: part.mode().iloc[0])
     lent = tracks.rename(columns={"particle": "track"})[["frame", "track", *POSITION, *stds]]
     lent["lender"] = lent["track"].map(owner)
     nobodys = lent[lent["lender"] < 0].assign(particle=-1)
     lent = lent.merge(here.rename(columns={"particle": "lender"}), on=["frame", "lender"], suffixes=("", "_true"))
-    start = {f: f.trajectories.start.set_index("particle")[["y_um", "z_um"]] for f in (film, other)}
-    lenders = start[film].loc[np.unique(lent["lender"])]
-    borrowers = start[other].loc[there["particle"].unique()]
-    near = KDTree(lenders).query(borrowers, k=3)[1]
-    chosen = lenders.index.to_numpy()[rng.permuted(near, axis=1)[:, 0]]
-    there["lender"] = there["particle"].map(dict(zip(borrowers.index, chosen, strict=True)))
-    made = there.merge(lent, on=["frame", "lender"], suffixes=("", "_lent"))
     for name in POSITION:
-        made[name] += made[f"{name}_lent"] - made[f"{name}_true"]
-    made = pd.concat([made, nobodys], ignore_index=True)
-    made["particle"] = made.groupby(["particle", "track"]).ngroup()
-    return made[["frame", "particle", *POSITION, *stds]].sort_values(["frame", "particle"], ignore_index=True)
+        lent[name] -= lent.pop(f"{name}_true")
+    start = start.loc[np.unique(lent["lender"])]
+    tree = KDTree(start)
+    for other in others:
+        there, borrowers = _paths(other)
+        near = tree.query(borrowers, k=3)[1]
+        chosen = start.index.to_numpy()[rng.permuted(near, axis=1)[:, 0]]
+        there["lender"] = there["particle"].map(dict(zip(borrowers.index, chosen, strict=True)))
+        made = there.merge(lent, on=["frame", "lender"], suffixes=("", "_off"))
+        for name in POSITION:
+            made[name] += made[f"{name}_off"]
+        made = pd.concat([made, nobodys], ignore_index=True)
+        made["particle"] = made.groupby(["particle", "track"]).ngroup()
+        yield made[["frame", "particle", *POSITION, *stds]].sort_values(["frame", "particle"], ignore_index=True)
+
+
+def _paths(film: Film) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Of the particles in view: where they are in each frame, and y and z at the start by their number."""
+    seen = film.to_channel(film.truth())[["frame", "particle", *POSITION]]
+    start = film.trajectories.start.set_index("particle")[["y_um", "z_um"]]
+    return seen, start.loc[seen["particle"].unique()]
