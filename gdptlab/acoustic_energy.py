@@ -1,7 +1,7 @@
 """From tracks to the strength of the sound: U of eqs (1a, 1b), and with it the acoustic energy density E_ac.
 
-A particle's path across the channel has a closed form (`Focusing.path`) with two unknowns: where the particle was, which
-is its own, and the rate 2πU/w, which is everybody's. Both are fitted to all tracks at once, along y and along z.
+A particle's path across the channel has a closed form (`Focusing.path`) with two unknowns: where the particle was,
+which is its own, and the rate 2πU/w, which is everybody's. Both are fitted to all tracks at once, for y and for z.
 
 Errors are larger than the standard deviations of positions say, and there is a remedy for each reason. A crowd closes
 in: in each second of the film all are enlarged by one factor, so that the middle half of the residuals is as it should
@@ -40,7 +40,7 @@ class _Rate:
     """Fit along one axis.
 
     log_ratio: logarithm of the fitted rate over that of the `Focusing`.
-    tracks, slices: what each track (G,), and each slice of depth (S,), contributed to it; their squares add to the variance.
+    tracks, slices: what each track (G,), and each slice of depth (S,), contributed; their squares sum to the variance.
     """
 
     log_ratio: float
@@ -171,19 +171,17 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
     stiffness = total((FREEDOM + 1) * (FREEDOM - square) / (FREEDOM + square) ** 2 / noise**2 * alone**2)
     slices = pd.factorize(np.floor(tracks["z_um"].to_numpy() / SLICE_UM))[0]
     # Of tracks the jackknife: by how much the result would change without this one.
-    return _Rate(
-        log_ratio, total(pull) / (stiffness.sum() - stiffness), np.bincount(slices, pull) / stiffness.sum()
-    )
+    return _Rate(log_ratio, total(pull) / (stiffness.sum() - stiffness), np.bincount(slices, pull) / stiffness.sum())
 
 
 def imitate(
     tracks: pd.DataFrame, film: Film, others: Iterable[Film], rng: int | np.random.Generator
 ) -> Iterator[pd.DataFrame]:
-    """Tracks as other films would give them, without measuring those: their true paths with the errors made in this one.
+    """Tracks as other films would give them, not measured, but made of their true paths and the errors of this one.
 
     Each particle of another film borrows all from one of this film, of the three that began nearest to it in the
-    cross-section: errors, standard deviations, frames in which it was missed, breaks of its track, the
-    stretch in which its track ran on along somebody else. So errors stay as far off, as lasting and as typical of a
+    cross-section: errors, standard deviations, frames in which it was missed or out of view, breaks of its track,
+    the stretch in which its track ran on along somebody else. So errors stay as far off, as lasting and as typical of a
     depth and a time as they were. Tracks of nobody stay where they are.
 
     Parameters
