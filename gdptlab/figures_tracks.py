@@ -34,34 +34,30 @@ def tracks_in_space(film: Film, tracks: pd.DataFrame, frame: int) -> Figure:
     Returns
     -------
     Figure
-        Colours are depths. Dots: where a track begins on the right, where it is now on the left.
+        Colours are the depths at which tracks begin. Dots: on the left where they are now, on the right where they begin.
     """
     channel, image = film.trajectories.focusing.channel, film[frame]
-    half = channel.height_um / 2
+    limits = {"cmap": DEPTH, "vmin": -channel.height_um / 2, "vmax": channel.height_um / 2}
     past = tracks[tracks["frame"] <= frame]
+    begin = past.groupby("particle").first()
     figure, axes = plt.subplot_mosaic(
-        [["frame", "section"]], figsize=(11, 4.6), layout="constrained", width_ratios=[1, 1.5]
+        [["frame", "section"]], figsize=(11, 4.4), layout="constrained", width_ratios=[1, 1.5]
     )
+    _limited(axes["section"], channel)
+    dots = axes["section"].scatter(begin["y_um"], begin["z_um"], c=begin["z_um"], s=16, zorder=2, **limits)
     axes["frame"].imshow(image, **_grey(image))
-    colour = plt.get_cmap(DEPTH)
-    for _, track in past.groupby("particle"):
-        look = {"color": colour(track["z_um"].iloc[-1] / (2 * half) + 0.5), "lw": 1.2}
-        axes["frame"].plot(track["x_px"], track["y_px"], **look)
+    for particle, track in past.groupby("particle"):
+        colour = dots.to_rgba(begin["z_um"][particle])
+        axes["frame"].plot(track["x_px"], track["y_px"], color=colour, lw=1.3)
         axes["section"].plot(track["y_um"], track["z_um"], color="0.6", lw=0.8, zorder=1)
     now = past[past["frame"] == frame]
-    begin = past.groupby("particle").first()
-    axes["frame"].scatter(
-        now["x_px"], now["y_px"], c=now["z_um"], cmap=DEPTH, vmin=-half, vmax=half, s=14, ec="white", lw=0.5
-    )
+    colours = begin["z_um"][now["particle"]]
+    axes["frame"].scatter(now["x_px"], now["y_px"], c=colours, s=16, ec="white", lw=0.6, zorder=3, **limits)
     rows, columns = image.shape
     axes["frame"].set(xlabel="x (px)", ylabel="y (px)", title=f"t = {frame / film.frame_rate_hz:g} s")
     axes["frame"].set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
     _scale_bar(axes["frame"], film.microscope.um_per_px, 50)
-    _limited(axes["section"], channel)
-    dots = axes["section"].scatter(
-        begin["y_um"], begin["z_um"], c=begin["z_um"], cmap=DEPTH, vmin=-half, vmax=half, s=16, zorder=2
-    )
-    figure.colorbar(dots, ax=axes["section"], label="z (µm)", shrink=0.8)
+    figure.colorbar(dots, ax=axes["section"], label="z at the start (µm)", shrink=0.8)
     axes["section"].set(
         xlabel="y (µm)", ylabel="z (µm)", title=f"{past['particle'].nunique()} tracks, from their dots on"
     )
@@ -134,7 +130,7 @@ def velocity_profiles(table: pd.DataFrame, focusing: Focusing) -> Figure:
     figure, axes = _panels(3, 12, 4)
     table = table.dropna(subset=["vx_um_s", "vy_um_s", "vz_um_s"])
     y, z = np.linspace(-w / 2, w / 2, 201), np.linspace(-h / 2, h / 2, 201)
-    layers = {f"|z| < {h / 10:g} µm": (0.0, h / 10), f"{0.2 * h:g} < |z| < {0.4 * h:g} µm": (0.2 * h, 0.4 * h)}
+    layers = {f"|z| < {h / 10:g} µm": (0.0, h / 10), f"{0.2 * h:g} < |z| < {0.3 * h:g} µm": (0.2 * h, 0.3 * h)}
     for k, (label, (low, high)) in enumerate(layers.items()):
         part = table[table["z_um"].abs().between(low, high)]
         inside = np.linspace(low, high, 9)
@@ -203,18 +199,17 @@ def collapsed_paths(
     Returns
     -------
     Figure
-        ln |tan(πy/w)| in time, likewise for z, each track moved up or down to the line at the middle of its time.
+        ln |tan(πy/w)| in time, likewise for z, each track moved up or down to the line, away from axis and walls.
     """
     figure, axes = _panels(2, 9.5, 3.8)
     t_s = tracks["frame"] / frame_rate_hz
     for panel, axis, amplitude in zip(axes[0], "yz", amplitudes_um_s, strict=True):
         extent = focusing.extent_um(axis)
         place = tracks[f"{axis}_um"].abs()
-        seen = (place > 0.02 * extent) & (place < 0.49 * extent)  # elsewhere noise is all there is
+        seen = place.between(0.05 * extent, 0.45 * extent)  # elsewhere noise is all there is
         table = pd.DataFrame({"t": t_s, "v": np.log(np.tan(np.pi * place / extent)), "p": tracks["particle"]})[seen]
         slope = -2 * np.pi * amplitude / extent
-        own = table.groupby("p")
-        table["v"] -= own["v"].transform("mean") - slope * own["t"].transform("mean")
+        table["v"] -= (table["v"] - slope * table["t"]).groupby(table["p"]).transform("median")
         panel.plot(table["t"], table["v"], ".", color=COLOURS[0], ms=1.2, alpha=0.5, rasterized=True, label="tracks")
         t = np.array([0, table["t"].max()])
         panel.plot(t, slope * t, color="black", lw=1.2, label=f"slope of $U_{axis}$ = {amplitude:.2f} µm/s")
