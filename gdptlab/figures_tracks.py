@@ -34,7 +34,7 @@ def tracks_in_space(film: Film, tracks: pd.DataFrame, frame: int) -> Figure:
     Returns
     -------
     Figure
-        Colours are the depths at which tracks begin. Dots: on the left where they are now, on the right where they begin.
+        Colours: depth at which a track begins. Dots: on the left where it is now, on the right where it begins.
     """
     channel, image = film.trajectories.focusing.channel, film[frame]
     limits = {"cmap": DEPTH, "vmin": -channel.height_um / 2, "vmax": channel.height_um / 2}
@@ -101,8 +101,8 @@ def one_track(track: pd.DataFrame, path: pd.DataFrame, frame_rate_hz: float) -> 
 def _binned(axes: Axes, place: NDArray, value: NDArray, edges: NDArray, colour: str, marker: str, label: str) -> None:
     """Median and quartiles of a velocity in bins of position."""
     groups = pd.Series(value).groupby(pd.cut(pd.Series(place), edges), observed=False)
-    middle = groups.median()
-    reach = [middle - groups.quantile(0.25), groups.quantile(0.75) - middle]
+    low, middle, high = (groups.quantile(q).to_numpy() for q in (0.25, 0.5, 0.75))
+    reach = np.stack([middle - low, high - middle])
     at = (edges[1:] + edges[:-1]) / 2
     axes.errorbar(
         at, middle, yerr=reach, color=colour, marker=marker, ls="", lw=1, capsize=2, ms=5, label=label, zorder=3
