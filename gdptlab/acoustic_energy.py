@@ -144,7 +144,7 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
     middle, log_ratio = total(place) / rows, 0.0
     for _ in range(_ROUNDS):
         # Off the walls, where nothing moves, and the axis, where by_middle would be 0 / 0.
-        middle = np.sign(middle) * np.clip(np.abs(middle), 1e-6 * extent, (0.5 - 1e-4) * extent)
+        middle = np.where(middle < 0, -1, 1) * np.clip(np.abs(middle), 1e-6 * extent, (0.5 - 1e-4) * extent)
         rate = start_per_s * np.exp(log_ratio)
         path = extent / np.pi * np.arctan(np.tan(np.pi * middle / extent)[track] * np.exp(-rate * t))
         swing = np.sin(2 * np.pi * path / extent)
@@ -158,20 +158,21 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
         alone = by_log - (total(weight * by_middle * by_log) / own)[track] * by_middle  # what no `middle` can do
         pull = weight * alone * (place - path)
         information = (weight * alone**2).sum()
-        if not information > 0:
-            raise ValueError(f"tracks: got none that move along {axis}, allowed are some that sound moves")
         step = float(np.clip(pull.sum() / information, -_LONGEST_STEP, _LONGEST_STEP))
         log_ratio += step
         middle = middle + total(weight * by_middle * (place - path - by_log * step)) / own
-        if abs(step) < 1e-8:
+        if abs(step) < 1e-7:
             break
     else:
-        raise ValueError(f"tracks: got some whose motion along {axis} fits no rate, allowed are those of sound")
+        raise ValueError(f"tracks: got some whose motion along {axis} fits no rate, allowed are those that sound moves")
     # How fast the pull falls as the rate rises; less than `information`, for far residuals lose weight meanwhile.
     stiffness = total((FREEDOM + 1) * (FREEDOM - square) / (FREEDOM + square) ** 2 / noise**2 * alone**2)
     slices = pd.factorize(np.floor(tracks["z_um"].to_numpy() / SLICE_UM))[0]
     # Of tracks the jackknife: by how much the result would change without this one.
-    return _Rate(log_ratio, total(pull) / (stiffness.sum() - stiffness), np.bincount(slices, pull) / stiffness.sum())
+    fitted = _Rate(log_ratio, total(pull) / (stiffness.sum() - stiffness), np.bincount(slices, pull) / stiffness.sum())
+    if not _variance(fitted.tracks, fitted.slices) < 1:
+        raise ValueError(f"tracks: got some that hardly move along {axis}, allowed are those that sound moves")
+    return fitted
 
 
 def imitate(

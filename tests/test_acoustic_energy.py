@@ -128,6 +128,18 @@ def test_contrast_and_radius_change_the_energy_and_not_the_velocity():
     assert other["E_J_m3"] / plain["E_J_m3"] == pytest.approx(ratio, rel=1e-4)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_sound_may_be_weak_but_not_absent(seed):
+    rng = np.random.default_rng(seed)
+    weak, none = (paths(rng, sound(energy), mean_in_view=15) for energy in (0.01, 1e-9))
+    for table in (weak, none):
+        for axis, std in (("y", 0.01), ("z", 0.12)):
+            table[f"{axis}_um"] += rng.normal(0, std, len(table))
+    assert fit_energy(weak, sound(), FPS).loc["E_J_m3", "value"] == pytest.approx(0.01, rel=0.01)
+    with pytest.raises(ValueError, match="along . fits no rate|hardly move along"):
+        fit_energy(none, sound(), FPS)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
