@@ -176,7 +176,7 @@ def links_in_time(scores: Mapping[str, pd.DataFrame]) -> Figure:
     for panel, (column, title) in zip(axes[0], titles.items(), strict=True):
         for k, (name, table) in enumerate(scores.items()):
             panel.plot(table.index, table[column], color=COLOURS[k], marker="os^D"[k], label=name)
-        panel.set(xlabel="t (s)", ylabel="share", title=title, ylim=(None, 1.02))
+        panel.set(xlabel="t (s)", ylabel="share", title=title)
     axes[0, 0].legend(fontsize="small", loc="lower left")
     return figure
 
