@@ -136,7 +136,7 @@ def test_sound_may_be_weak_but_not_absent(seed):
         for axis, std in (("y", 0.01), ("z", 0.12)):
             table[f"{axis}_um"] += rng.normal(0, std, len(table))
     assert fit_energy(weak, sound(), FPS).loc["E_J_m3", "value"] == pytest.approx(0.01, rel=0.01)
-    with pytest.raises(ValueError, match="along . fits no rate|hardly move along"):
+    with pytest.raises(ValueError, match=r"along . fits no rate|hardly move along"):
         fit_energy(none, sound(), FPS)
 
 
