@@ -179,7 +179,8 @@ class Film:
         Returns
         -------
         DataFrame
-            Copy with `x_um`, downstream from the frame's left edge, and `y_um`, from the channel's middle.
+            Copy with `x_um`, downstream from the frame's left edge, and `y_um`, from the channel's middle; of
+            `x_std_px` and `y_std_px`, if there, `x_std_um` and `y_std_um`.
 
         Raises
         ------
@@ -189,7 +190,8 @@ class Film:
         if not {"x_px", "y_px"} <= set(table):
             raise ValueError(f"table: got columns {list(table)}, needed are x_px and y_px")
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2
-        return table.assign(x_um=(table["x_px"] + 0.5) * scale, y_um=(table["y_px"] - middle) * scale)
+        stds = {f"{a}_std_um": table[f"{a}_std_px"] * scale for a in "xy" if f"{a}_std_px" in table}
+        return table.assign(x_um=(table["x_px"] + 0.5) * scale, y_um=(table["y_px"] - middle) * scale, **stds)
 
     def _to_pixels(self, table: pd.DataFrame) -> pd.DataFrame:
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2

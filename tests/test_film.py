@@ -35,6 +35,10 @@ def test_axes_of_frame_and_channel():
     back = film.to_channel(truth)
     np.testing.assert_allclose(back["x_um"], [0.325, 50, 100])
     np.testing.assert_allclose(back["y_um"], [0, -60, 33], atol=1e-12)
+    assert "x_std_um" not in back
+    measured = film.to_channel(truth.assign(x_std_px=0.1, y_std_px=[0.2, 0.4, 0.0]))
+    np.testing.assert_allclose(measured["x_std_um"], 0.065)
+    np.testing.assert_allclose(measured["y_std_um"], [0.13, 0.26, 0])
 
 
 def test_light_is_where_the_truth_says():

@@ -1,0 +1,261 @@
+"""Tracks against paths that are known; links, velocities and scores against those made by hand."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from gdptlab import Calibration, batch
+from gdptlab.channel import Channel, Focusing, Trajectories
+from gdptlab.film import Film
+from gdptlab.tracks import identify, link, link_scores, velocities
+
+FPS = 20.0
+CHANNEL = Channel(width_um=180, height_um=90, flow_rate_ul_h=40)  # 1.4 mm/s on the axis: 68 µm in a frame
+STILL = Channel(width_um=180, height_um=90, flow_rate_ul_h=1e-6)
+
+
+def carried(x_um, y_um, z_um, frames=12) -> pd.DataFrame:
+    """Particles that the flow carries, from where they are at frame 0; `true` is their number."""
+    start = pd.DataFrame({"x_um": x_um, "y_um": y_um, "z_um": z_um}, dtype=float).rename_axis("true").reset_index()
+    speed = CHANNEL.velocity(start.y_um, start.z_um)
+    parts = [start.assign(frame=k, x_um=start.x_um + speed * k / FPS) for k in range(frames)]
+    return pd.concat(parts, ignore_index=True)
+
+
+def partition(tracks: pd.DataFrame) -> set:
+    """Tracks as sets of (frame, true particle)."""
+    return {frozenset(zip(t.frame, t.true, strict=True)) for _, t in tracks.groupby("particle")}
+
+
+def noisy_paths(seed=3, mean_in_view=100, duration_s=2.0, missed=0.03) -> tuple[pd.DataFrame, pd.DataFrame, Focusing]:
+    """Paths of the paper's experiment in µm, some frames missed, and with errors whose size is known."""
+    rng = np.random.default_rng(seed)
+    paths = Trajectories.seeded(Focusing(), rng, mean_in_view=mean_in_view, duration_s=duration_s)
+    true = paths.table(np.arange(0, duration_s, 1 / 25))
+    table = true[rng.random(len(true)) > missed].reset_index(drop=True)
+    for axis, std in zip("xyz", (0.02, 0.03, 0.2), strict=True):
+        table[f"{axis}_std_um"] = std * rng.uniform(0.5, 2, len(table))
+        table[f"{axis}_um"] += rng.normal(0, table[f"{axis}_std_um"])
+    return table.rename(columns={"particle": "true"}), true, paths.focusing
+
+
+# -------------------- linking
+
+
+def test_the_flow_says_where_to_look():
+    # Seen at rest, each would be where another was: they follow each other at 10 µm and move by 40 to 70 µm.
+    table = carried([0, 10, 20, 5, 15], [3, 3, 3, 60, -60], [-4, -4, -4, 20, 10])
+    shuffled = table.sample(frac=1, random_state=1)
+    tracks = link(shuffled, CHANNEL, FPS)
+    assert partition(tracks) == {frozenset((k, n) for k in range(12)) for n in range(5)}
+    assert tracks.columns.tolist() == [*table.columns, "particle"]
+    assert tracks.index.equals(pd.RangeIndex(60)) and tracks.frame.is_monotonic_increasing
+    assert tracks.particle[:5].tolist() == [0, 1, 2, 3, 4]
+    at_rest = link(table, STILL, FPS, min_rows=1)
+    assert at_rest.particle.nunique() > 30
+    with pytest.raises(ValueError, match="needed are"):
+        link(table.drop(columns="frame"), CHANNEL, FPS)
+
+
+@pytest.mark.parametrize(("missed", "n"), [((4, 5, 6), 1), ((4, 5, 6, 7), 2)])
+def test_gaps_are_bridged_up_to_memory(missed, n):
+    table = carried([0], [10], [-20])
+    tracks = link(table[~table.frame.isin(missed)], CHANNEL, FPS, memory=3, min_rows=1)
+    assert tracks.particle.nunique() == n
+    assert tracks.frame.tolist() == [k for k in range(12) if k not in missed]
+
+
+@pytest.mark.parametrize("axis", "xyz")
+def test_reach_is_of_each_axis(axis):
+    table = pd.DataFrame({"frame": range(12), "x_um": 3.0, "y_um": 10.0, "z_um": -20.0})
+    table.loc[table.frame >= 6, f"{axis}_um"] += 2.0
+    limits = {2.2: 1, 1.8: 2}
+    for reach, n in limits.items():
+        for others in (0.5, 2.5, 9.0):
+            reach_um = tuple(reach if a == axis else others for a in "xyz")
+            assert link(table, STILL, FPS, reach_um=reach_um, min_rows=1).particle.nunique() == n
+
+
+def test_short_tracks_are_left_out_and_numbers_have_no_holes():
+    table = pd.concat([carried([0], [50], [0], frames=4), carried([0], [-50], [5])]).assign(particle=99, cm=0.9)
+    tracks = link(table, CHANNEL, FPS, min_rows=5)
+    assert len(tracks) == 12 and (tracks.particle == 0).all() and (tracks.y_um == -50).all()
+    assert link(table, CHANNEL, FPS, min_rows=4).particle.unique().tolist() == [0, 1]
+    assert (tracks.cm == 0.9).all()  # what else is known of a particle stays
+
+
+def test_tracks_in_a_crowd_are_the_true_ones_whatever_the_order():
+    table, true, focusing = noisy_paths()
+    tracks = link(table, focusing.channel, 25)
+    purity = tracks.groupby("particle").true.agg(lambda t: t.value_counts(normalize=True).iloc[0])
+    assert purity.mean() > 0.995 and tracks.particle.nunique() < 1.1 * true.particle.nunique()
+    assert len(tracks) > 0.97 * len(table)
+    assert partition(link(table.sample(frac=1, random_state=5), focusing.channel, 25)) == partition(tracks)
+
+
+def test_nothing_is_said_and_the_table_stays_as_it_was(capfd, caplog):
+    table = carried([0], [10], [-20])
+    before = table.copy()
+    assert len(link(table, CHANNEL, FPS)) == 12
+    assert capfd.readouterr() == ("", "") and not caplog.records
+    pd.testing.assert_frame_equal(table, before)
+
+
+def test_outside_the_channel_the_flow_is_that_of_the_wall():
+    table = pd.DataFrame({"frame": range(12), "x_um": 5.0, "y_um": 91.0, "z_um": -46.0})
+    assert link(table, CHANNEL, FPS).particle.tolist() == [0] * 12
+
+
+def test_no_particles_give_no_tracks():
+    nothing = link(carried([0], [10], [-20]).iloc[:0], CHANNEL, FPS)
+    assert len(nothing) == 0 and nothing.particle.dtype == np.int64
+    assert len(link(carried([0], [10], [-20]), CHANNEL, FPS, min_rows=13)) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        ({"channel": 3}, TypeError, "channel"),
+        ({"frame_rate_hz": 0.0}, ValueError, "frame_rate_hz"),
+        ({"reach_um": (1.0, 2.0)}, ValueError, "reach_um.*three"),
+        ({"reach_um": (1.0, 2.0, -1.0)}, ValueError, "reach_um"),
+        ({"memory": -1}, ValueError, "memory"),
+        ({"min_rows": 0}, ValueError, "min_rows"),
+        ({"table": [1, 2]}, TypeError, "table"),
+        ({"table": carried([np.nan], [1], [1])}, ValueError, "finite"),
+        ({"table": carried([0], [1], [1]).assign(frame=0.5)}, TypeError, "whole"),
+    ],
+)
+def test_bad_arguments_of_link(change, error, match):
+    arguments = {"table": carried([0], [1], [1]), "channel": CHANNEL, "frame_rate_hz": FPS} | change
+    with pytest.raises(error, match=match):
+        link(**arguments)
+
+
+# -------------------- velocities
+
+
+def bent(frames, particle=0) -> pd.DataFrame:
+    """A track along parabolas, other ones along each axis, without errors."""
+    t = np.array(frames) / FPS
+    table = pd.DataFrame({"frame": frames, "particle": particle})
+    table["x_um"], table["y_um"], table["z_um"] = 300 + 7 * t, -20 - 4 * t + 3 * t**2, 40 - 9 * t - 2 * t**2
+    table["vx_true"], table["vy_true"], table["vz_true"] = 7.0, -4 + 6 * t, -9 - 4 * t
+    return table.assign(x_std_um=0.02, y_std_um=0.03, z_std_um=0.2)
+
+
+def test_velocities_of_parabolas_are_exact_also_at_ends_and_gaps():
+    frames = [3, 4, 5, 6, 7, 9, 10, 14, 15, 16, 17, 18, 19]
+    other = bent(range(0, 30), particle=8).assign(y_um=lambda t: -t.y_um, vy_true=lambda t: -t.vy_true)
+    table = pd.concat([bent(frames, particle=5), other]).sample(frac=1, random_state=2)
+    found = velocities(table, FPS, window=9)
+    for axis in "xyz":
+        np.testing.assert_allclose(found[f"v{axis}_um_s"], found[f"v{axis}_true"], atol=1e-6)
+    assert found.index.equals(table.index)
+
+
+def test_velocities_are_those_of_a_weighted_fit():
+    rng = np.random.default_rng(4)
+    table = bent([2, 3, 4, 6, 7, 8, 11, 12])
+    table["z_std_um"] = rng.uniform(0.1, 0.4, len(table))
+    table["z_um"] += rng.normal(0, 3 * table.z_std_um)
+    found = velocities(table, FPS, window=9).iloc[3]
+    near = table[(table.frame - 6).abs() <= 4]
+    t = (near.frame - 6) / FPS
+    fit, covariance = np.polyfit(t, near.z_um, 2, w=1 / near.z_std_um, cov="unscaled")
+    chi2 = (((near.z_um - np.polyval(fit, t)) / near.z_std_um) ** 2).sum() / (len(near) - 3)
+    assert chi2 > 1.5  # so the errors are to be enlarged
+    np.testing.assert_allclose(found[["vz_um_s", "vz_std_um_s"]], [fit[1], np.sqrt(covariance[1, 1] * chi2)])
+
+
+def test_standard_deviations_of_velocities_are_true():
+    table, true, focusing = noisy_paths(missed=0.1)
+    found = velocities(table.rename(columns={"true": "particle"}), 25)
+    found = found.merge(true, on=["frame", "particle"], suffixes=("", "_true")).dropna()
+    expected = {"x": focusing.channel.velocity(found.y_um_true, found.z_um_true)}
+    expected |= {axis: focusing.radiation_velocity(axis, found[f"{axis}_um_true"]) for axis in "yz"}
+    for axis, value in expected.items():
+        over = (found[f"v{axis}_um_s"] - value) / found[f"v{axis}_std_um_s"]
+        assert 0.8 < over.std() < 1.1 and abs(over.mean()) < 0.1  # a little below 1: they are never made smaller
+    assert len(found) > 0.95 * len(table)
+
+
+def test_too_few_neighbours_give_nan():
+    found = velocities(bent([0, 1, 2, 3, 20, 21, 22, 23, 24]), FPS, window=9)
+    values = found[["vx_um_s", "vx_std_um_s", "vz_um_s"]].notna()
+    assert values.all(axis=1).tolist() == [False] * 4 + [True] * 5
+    assert not values.iloc[:4].any(axis=None)
+    assert velocities(found.iloc[:0], FPS)["vz_std_um_s"].tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "match"),
+    [
+        ({}, {"window": 8}, "window.*odd"),
+        ({}, {"window": 3}, "window"),
+        ({"y_std_um": 0.0}, {}, "above 0"),
+        ({"z_um": np.nan}, {}, "finite"),
+        ({"frame": 4}, {}, "twice"),
+    ],
+)
+def test_bad_arguments_of_velocities(change, settings, match):
+    with pytest.raises(ValueError, match=match):
+        velocities(bent(range(9)).assign(**change), FPS, **settings)
+    with pytest.raises(ValueError, match="z_std_um"):
+        velocities(bent(range(9)).drop(columns="z_std_um"), FPS)
+
+
+# -------------------- scores
+
+
+def by_hand() -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Two true particles over six frames, 7 and 8, and three tracks that are partly theirs."""
+    frames = np.arange(6)
+    true = pd.concat(
+        [
+            pd.DataFrame({"frame": frames, "particle": 7, "x_px": 50.0 + frames, "y_px": 20.0, "z_um": -30.0}),
+            pd.DataFrame({"frame": frames, "particle": 8, "x_px": 90.0 + frames, "y_px": 60.0, "z_um": 25.0}),
+        ],
+        ignore_index=True,
+    )
+    seven, eight = (true[true.particle == n].set_index("frame") for n in (7, 8))
+    parts = [
+        seven.loc[[0, 1, 3, 4]].assign(particle=0),  # right, a gap, right
+        eight.loc[[0, 1]].assign(particle=1),
+        seven.loc[[2]].assign(particle=1),  # hops to the other one,
+        eight.loc[[3]].assign(particle=1, z_um=40.0),  # and then is 15 µm off: nobody
+        eight.loc[[4, 5]].assign(particle=2),
+    ]
+    return pd.concat(parts).reset_index(), true
+
+
+def test_scores_counted_by_hand():
+    tracks, true = by_hand()
+    who = identify(tracks, true)
+    assert who.tolist() == [7] * 4 + [8, 8, 7, -1, 8, 8]
+    found = link_scores(tracks.sample(frac=1, random_state=3), true)
+    expected = {
+        "n_tracks": 3, "n_links": 7, "right": 5 / 7, "wrong": 1 / 7, "nobody": 1 / 7, "found": 5 / 10,
+        "n_gaps": 1, "gaps_right": 1.0, "n_particles": 2, "broken": 1.0, "pieces": 2.0,
+    }  # fmt: skip
+    assert found.to_dict() == pytest.approx(expected)
+    assert link_scores(tracks, true, within_um=20)["wrong"] == pytest.approx(2 / 7)
+
+
+def test_scores_of_nothing_and_without_a_column():
+    tracks, true = by_hand()
+    nothing = link_scores(tracks.iloc[:0], true)
+    assert nothing["n_links"] == 0 and nothing["found"] == 0 and np.isnan(nothing["right"])
+    with pytest.raises(ValueError, match="particle"):
+        link_scores(tracks.drop(columns="particle"), true)
+    with pytest.raises(ValueError, match="x_px"):
+        identify(tracks, true.drop(columns="x_px"))
+
+
+def test_links_of_a_film_that_was_rendered_and_measured():
+    film = Film.seeded(6, mean_in_view=25, duration_s=1.2, shape=(320, 260))
+    calibration = Calibration.from_stack(*film.stack(size=63), n_sub=9)
+    measured = film.to_channel(batch(film, calibration, method="joint", progress=False))
+    tracks = link(measured, film.trajectories.focusing.channel, film.frame_rate_hz)
+    found = link_scores(tracks, film.truth())
+    assert found["right"] >= 0.98 and found["found"] > 0.95 and found["pieces"] < 1.1
