@@ -89,7 +89,9 @@ def real_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
     if array.dtype.kind not in "buif":
         raise TypeError(f"{name}: got values of type {array.dtype}, allowed are real numbers")
     if array.ndim != ndim or 0 in array.shape:
-        raise ValueError(f"{name}: got shape {array.shape}, allowed are {ndim} axes, none of them empty")
+        colour = array.shape[ndim:] in ((3,), (4,))
+        grey = f"; for a colour image take one channel, as in {name}[..., 1]" if colour else ""
+        raise ValueError(f"{name}: got shape {array.shape}, allowed are {ndim} axes, none of them empty{grey}")
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(array, dtype=np.float32)
     if not np.isfinite(array).all():
