@@ -17,8 +17,8 @@ A particle is then measured only if its whole window lies in the frame; nothing 
 template wide. Or jointly (`overlap`): particles may overlap and be cut by the frame's edge.
 """
 
-from collections.abc import Iterable
-from itertools import islice
+from collections.abc import Container, Iterable, Iterator
+from itertools import count, islice
 
 import cv2
 import numpy as np
@@ -32,6 +32,7 @@ from tqdm.auto import tqdm
 from gdptlab.calibration import Calibration
 from gdptlab.check import choice, positive, real_array, whole
 from gdptlab.cores import on_one_core
+from gdptlab.images import Images
 from gdptlab.overlap import Explained, Overlap
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
@@ -322,12 +323,14 @@ def batch(
     Parameters
     ----------
     frames : iterable of arrays (rows, columns)
-        A list, a stack, a generator: read in blocks of `BLOCK` frames and at most `n_jobs` + 1 blocks ahead,
-        so that a film need not fit into memory.
+        A list, a stack, a memory map, a dask array, a generator: read in blocks of `BLOCK` frames and at most
+        `n_jobs` + 1 blocks ahead, so that a film need not fit into memory. Images of `open_images` are read by
+        the process that measures them.
     calibration : Calibration
     n_jobs : int
         Processes to spread the blocks over; -1 for one per core. The result does not depend on it. They
-        take some seconds to start, once, and stay for the next film.
+        take some seconds to start, once, and stay for the next film. Under `joblib.parallel_config(backend="dask")`
+        the blocks go to all workers of the dask cluster instead.
     progress : bool
         Show a progress bar.
     **settings
@@ -344,27 +347,63 @@ def batch(
     TypeError, ValueError
         As `locate`: for settings at once, for frames at the first that is refused.
     """
+    blank = blank_table(calibration, n_jobs, settings)
+    try:
+        iter(frames)
+    except TypeError as error:
+        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+    tables = [blank]
+    total = len(frames) if hasattr(frames, "__len__") else None
+    with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
+        for _, n, table in in_blocks(frames, calibration, n_jobs, settings):
+            tables.append(table)
+            bar.update(n)
+    return pd.concat(tables, ignore_index=True)[[*blank]]
+
+
+def blank_table(calibration: Calibration, n_jobs: int, settings: dict[str, object]) -> pd.DataFrame:
+    """Table of a blank frame, as from `batch`, if the arguments are what that takes.
+
+    What is wrong with the settings is refused before the film begins, and what a calibration makes only when it
+    is needed is made here, not by every process for every block.
+    """
     if n_jobs != -1:
         whole("n_jobs", n_jobs, 1, 10_000)
-    # A blank frame: what is wrong with the settings is refused before the film begins, and what a calibration
-    # makes only when it is needed is made here, not by every process for every block.
     blank = locate(np.zeros((_size(calibration),) * 2), calibration, **settings)
-    total = len(frames) if hasattr(frames, "__len__") else None
-    copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
-    blocks = iter(lambda: list(islice(copies, BLOCK)), [])
-    jobs = (delayed(_located)(block, i * BLOCK, calibration, settings) for i, block in enumerate(blocks))
-    tables = [blank.assign(frame=0)]
-    with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
-        for count, table in Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs):
-            tables.append(table)
-            bar.update(count)
-    return pd.concat(tables, ignore_index=True)[["frame", *blank]]
+    return blank.assign(frame=0)[["frame", *blank]]
+
+
+def in_blocks(
+    frames: Iterable[ArrayLike],
+    calibration: Calibration,
+    n_jobs: int,
+    settings: dict[str, object],
+    done: Container[int] = (),
+) -> Iterator[tuple[int, int, pd.DataFrame]]:
+    """Measure blocks of frames: number of the first frame, how many, and their table, in order.
+
+    Blocks whose first frame is in `done` are left out. Each begins anew, so a table does not depend on the others.
+    """
+    jobs = (delayed(_located)(block, first, calibration, settings) for first, block in _blocks(frames, done))
+    yield from Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs)
+
+
+def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:
+    """Number of the first frame, and frames, of each block not in `done`, to be handed to a process."""
+    if isinstance(frames, Images | np.ndarray) or hasattr(frames, "dask"):
+        blocks = (frames[first : first + BLOCK] for first in range(0, len(frames), BLOCK))  # nothing is read yet
+    else:
+        copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
+        blocks = iter(lambda: list(islice(copies, BLOCK)), [])
+    for first, block in zip(count(0, BLOCK), blocks, strict=False):
+        if first not in done:
+            yield first, np.array(block) if hasattr(block, "dask") else block
 
 
 def _located(
-    block: list[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
-) -> tuple[int, pd.DataFrame]:
-    """How many frames are in a block that begins with number `first`, and what is in them."""
+    block: Iterable[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
+) -> tuple[int, int, pd.DataFrame]:
+    """Number of the first frame of a block, how many there are, and what is in them."""
     tables, before = [], None
     for i, frame in enumerate(block, first):
         if settings.get("method") == "joint":
@@ -372,4 +411,5 @@ def _located(
         else:
             table = locate(frame, calibration, **settings)
         tables.append(table.assign(frame=i))
-    return len(block), pd.concat(tables, ignore_index=True)
+    table = pd.concat(tables, ignore_index=True)
+    return first, len(tables), table[["frame", *table.columns.drop("frame")]]
