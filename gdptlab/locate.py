@@ -390,14 +390,18 @@ def in_blocks(
 
 def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:
     """Number of the first frame, and frames, of each block not in `done`, to be handed to a process."""
-    if isinstance(frames, Images | np.ndarray) or hasattr(frames, "dask"):
+    is_dask = hasattr(frames, "dask")
+    if isinstance(frames, Images | np.ndarray) or is_dask:
         blocks = (frames[first : first + BLOCK] for first in range(0, len(frames), BLOCK))  # nothing is read yet
     else:
         copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
         blocks = iter(lambda: list(islice(copies, BLOCK)), [])
     for first, block in zip(count(0, BLOCK), blocks, strict=False):
         if first not in done:
-            yield first, np.array(block) if hasattr(block, "dask") else block
+            # A list goes along with its task; an array a cluster would put on one worker, and lose with it.
+            if not isinstance(block, Images):
+                block = list(block.compute(scheduler="synchronous") if is_dask else block)
+            yield first, block
 
 
 def _located(
