@@ -79,7 +79,7 @@ def test_same_as_batch(film, made, expected, tmp_path, method, kind):
         "map": np.load(tmp_path / "film.npy", mmap_mode="r"),
     }[kind]
     assert_same(streamed(frames, made, tmp_path / "out", **SETTINGS[method]), expected[method])
-    assert len(expected[method]) > 80
+    assert len(expected[method]) > 50
 
 
 def test_parts_and_note(film, made, expected, tmp_path):
@@ -266,14 +266,14 @@ def test_batch_on_a_cluster(film, made, expected, tmp_path, cluster, kind):
 
 
 def test_a_worker_killed_in_mid_run(film, made, expected, tmp_path, cluster):
-    repeats = 40 if THOROUGH else 10
+    repeats = 40 if THOROUGH else 4
     frames = np.concatenate([film] * repeats)
     tifffile.imwrite(tmp_path / "film.tif", frames, photometric="minisblack")
     (folder := tmp_path / "out").mkdir()
     killed = []
 
     def kill():
-        while len(list(folder.glob("[0-9]*"))) < 3 * repeats // 5:
+        while len(list(folder.glob("[0-9]*"))) < 6:
             time.sleep(0.005)
         killed.append(next(iter(cluster.run(os.getpid).values())))
         os.kill(killed[0], signal.SIGTERM if sys.platform == "win32" else signal.SIGKILL)
