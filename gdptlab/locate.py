@@ -30,7 +30,7 @@ from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
 from gdptlab.calibration import Calibration
-from gdptlab.check import choice, positive, real_array, whole
+from gdptlab.check import choice, flag, positive, real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.images import Images
 from gdptlab.overlap import Explained, Overlap
@@ -108,12 +108,12 @@ def locate(
     ['x_px', 'y_px', 'z_um', 'cm', 'at_end']
     """
     if choice("method", method, METHODS) == "joint":
-        if (threshold, refine, min_distance_px) != (0.5, True, None):
+        if positive("threshold", threshold) != 0.5 or not flag("refine", refine) or min_distance_px is not None:
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
         return _overlapping(image, calibration, None)[0]
     image, distance = _checked(image, calibration, threshold, min_distance_px)
     place, step, cm = _candidates(image, calibration, threshold)
-    if refine:
+    if flag("refine", refine):
         place, step, cm = _refined(image, calibration, place, step)
     kept = _strongest(place, np.where(cm >= threshold, cm, 0), distance)
     place, step, cm = place[kept], step[kept], cm[kept]
