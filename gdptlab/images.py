@@ -283,8 +283,13 @@ def _depths_of_names(files: list[str], pattern: str | None) -> NDArray[np.float6
 
 def _paths(path: Path) -> list[Path]:
     """Files that are meant by a path, in the order of their names."""
-    folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
+    try:
+        folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
+    except OSError as error:  # a name too long, or a folder that is locked
+        raise ValueError(f"path: got {str(path)[:200]!r}, which cannot be looked at: {error.strerror}") from error
     if folder is not path and (path.exists() or not re.search(r"[*?\[]", pattern)):
+        if not path.exists():
+            raise FileNotFoundError(f"path: got {str(path)!r}, where there is no file")
         return [path]
     found = [p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
     if not found:

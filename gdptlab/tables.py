@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from gdptlab import check
 from gdptlab.calibration import Calibration
-from gdptlab.check import choice, positive
 from gdptlab.files import written_whole
 from gdptlab.locate import locate
 from gdptlab.versions import versions
@@ -40,8 +40,9 @@ def in_um(table: pd.DataFrame, um_per_px: float) -> pd.DataFrame:
     TypeError, ValueError
         If `table` is no table, or `um_per_px` no number above 0.
     """
-    um_per_px = positive("um_per_px", um_per_px)
-    lengths = [str(name) for name in _table("table", table) if str(name).endswith("_px")]
+    um_per_px = check.positive("um_per_px", um_per_px)
+    lengths = [name for name in check.table("table", table, ()) if str(name).endswith("_px")]
+    check.table("table", table, lengths)
     return table.assign(**{name.removesuffix("_px") + "_um": um_per_px * table[name] for name in lengths})
 
 
@@ -98,10 +99,14 @@ def save_table(table: pd.DataFrame, path: str | os.PathLike[str], calibration: C
         If there is no such folder.
     """
     path = _path(path, (".csv", ".parquet"))
-    table = _table("table", table)
+    check.table("table", table, ())
     note = as_json(about(calibration, settings))
+    write = table.to_csv if path.suffix == ".csv" else table.to_parquet
     with written_whole(path) as temporary:
-        table.to_csv(temporary, index=False) if path.suffix == ".csv" else table.to_parquet(temporary, index=False)
+        try:
+            write(temporary, index=False)
+        except (TypeError, ValueError, NotImplementedError) as error:
+            raise TypeError(f"table: got a column of a kind that {path.suffix} does not hold: {error}") from error
     with written_whole(path.with_name(path.name + ".json")) as temporary:
         temporary.write_text(note)
 
@@ -134,11 +139,9 @@ def save_points(
         If there is no such folder.
     """
     path = _path(path, (".csv",))
-    choice("program", program, POINTS)
-    missing = {"x_px", "y_px", "z_um"} - set(_table("table", table))
-    if missing:
-        raise ValueError(f"table: got no column {sorted(missing)}, needed are x_px, y_px and z_um")
-    scale = 1.0 if um_per_px is None else positive("um_per_px", um_per_px)
+    check.choice("program", program, POINTS)
+    check.table("table", table, ("x_px", "y_px", "z_um"))
+    scale = 1.0 if um_per_px is None else check.positive("um_per_px", um_per_px)
     frame = table["frame"] if "frame" in table else pd.Series(0, table.index)
     if program == "napari":
         place = [scale * table["y_px"], scale * table["x_px"]]
@@ -153,12 +156,6 @@ def save_points(
     with written_whole(path) as temporary:
         points = pd.DataFrame(points).set_axis(range(first, first + len(table)))
         points.to_csv(temporary, index_label=name_of_row)
-
-
-def _table(name: str, table: pd.DataFrame) -> pd.DataFrame:
-    if not isinstance(table, pd.DataFrame):
-        raise TypeError(f"{name}: got a {type(table).__name__}, allowed is a DataFrame")
-    return table
 
 
 def _path(path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> Path:
