@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from gdptlab.check import number, positive, real_array
+from gdptlab.check import table as check_table
 
 RESAMPLES = 1000
 """Draws of the bootstrap."""
@@ -40,15 +41,15 @@ def match(
 
     Raises
     ------
+    TypeError
+        If a table is none, or a column does not hold real numbers.
     ValueError
         If a column is missing, or row labels repeat.
     """
     positive("within_px", within_px)
     positive("within_um", within_um)
     for name, table in (("measured", measured), ("true", true)):
-        missing = set(AXES.values()) - set(table)
-        if missing:
-            raise ValueError(f"{name}: got no column {sorted(missing)}, needed are x_px, y_px and z_um")
+        check_table(name, table, AXES.values())
         if not table.index.is_unique:
             raise ValueError(f"{name}: got row labels that repeat, allowed are unique ones (see reset_index)")
     if ("frame" in measured) != ("frame" in true):

@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter, median, uniform_filter1d
 from scipy.ndimage import shift as shift_image
 from skimage.registration import phase_cross_correlation
 
-from gdptlab.check import positive, real_array, whole
+from gdptlab.check import flag, positive, real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.correlation import Correlator, normalised
 from gdptlab.displacement import Displacement
@@ -115,7 +115,7 @@ class Calibration:
         order = np.argsort(z_um)[np.rint(np.linspace(0, len(stack) - 1, n)).astype(int)]
         stack, z_um = stack[order], z_um[order]
         subset = ((np.arange(n_sub) + 0.5) * (n - 1) / n_sub + 0.5).astype(np.int64)  # to the nearest
-        return cls(stack, z_um, subset, normalised(levelled(denoised(stack) if denoise else stack)))
+        return cls(stack, z_um, subset, normalised(levelled(denoised(stack) if flag("denoise", denoise) else stack)))
 
     @classmethod
     @on_one_core

@@ -6,7 +6,11 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
+
+LARGEST = 1e12
+"""Of the numbers in an array: the square of their sum over an image still fits into float32."""
 
 
 def number(name: str, value: Any) -> float:
@@ -61,6 +65,19 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
     return int(value)
 
 
+def flag(name: str, value: Any) -> bool:
+    """Return `value` as a bool if it is True or False.
+
+    Raises
+    ------
+    TypeError
+        If it is neither.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name}: got {value!r}, allowed are True and False")
+    return bool(value)
+
+
 def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
     """Return `value` if it is one of the `allowed` words.
 
@@ -70,8 +87,30 @@ def choice(name: str, value: Any, allowed: Iterable[str]) -> str:
         If it is not.
     """
     allowed = list(allowed)
-    if value not in allowed:
+    if not isinstance(value, str) or value not in allowed:
         raise ValueError(f"{name}: got {value!r}, allowed are {', '.join(map(repr, allowed))}")
+    return value
+
+
+def table(name: str, value: Any, columns: Iterable[str]) -> pd.DataFrame:
+    """Return `value` if it is a table with real numbers in these columns, and in `frame` if it has one.
+
+    Raises
+    ------
+    TypeError
+        If it is no table, or a column does not hold real numbers.
+    ValueError
+        If a column is missing.
+    """
+    if not isinstance(value, pd.DataFrame):
+        raise TypeError(f"{name}: got a {type(value).__name__}, allowed is a DataFrame")
+    columns = list(columns)
+    missing = sorted(set(columns) - set(value))
+    if missing:
+        raise ValueError(f"{name}: got no column {missing}, needed are {', '.join(columns)}")
+    for column in [*columns, *({"frame"} & set(value))]:
+        if value[column].dtype.kind not in "buif":
+            raise TypeError(f"{name}: got {column} of type {value[column].dtype}, allowed are real numbers")
     return value
 
 
@@ -83,15 +122,22 @@ def real_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
     TypeError
         If `value` does not hold real numbers.
     ValueError
-        If it has another number of axes, is empty, or holds NaN or infinity.
+        If it has another number of axes, is empty, or holds NaN, infinity or numbers beyond `LARGEST`.
     """
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name}: got what is no array ({error}), allowed are {ndim} axes of real numbers") from error
     if array.dtype.kind not in "buif":
         raise TypeError(f"{name}: got values of type {array.dtype}, allowed are real numbers")
     if array.ndim != ndim or 0 in array.shape:
-        raise ValueError(f"{name}: got shape {array.shape}, allowed are {ndim} axes, none of them empty")
+        colour = array.shape[ndim:] in ((3,), (4,))
+        grey = f"; for a colour image take one channel, as in {name}[..., 1]" if colour else ""
+        raise ValueError(f"{name}: got shape {array.shape}, allowed are {ndim} axes, none of them empty{grey}")
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(array, dtype=np.float32)
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: got NaN or infinity, allowed are finite numbers that fit into float32")
+    if max(array.max(), -array.min()) > LARGEST:
+        raise ValueError(f"{name}: got numbers up to {np.abs(array).max():g}, allowed is up to {LARGEST:g}")
     return array

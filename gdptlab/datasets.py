@@ -14,7 +14,8 @@ from IPython import get_ipython
 from numpy.typing import NDArray
 
 from gdptlab.check import choice
-from gdptlab.files import read_images, written_whole
+from gdptlab.files import written_whole
+from gdptlab.images import open_images
 from gdptlab.imagetypes import IMAGE_TYPES
 from gdptlab.optics import Microscope
 
@@ -84,9 +85,9 @@ def sample(image_type: str = "fluorescent") -> Sample:
     """
     choice("image_type", image_type, IMAGE_TYPES)
     return Sample(
-        stack=read_images(DATA / f"{image_type}-calibration.tif"),
+        stack=np.asarray(open_images(DATA / f"{image_type}-calibration.tif")),
         z_um=pd.read_csv(DATA / "calibration-z.csv")["z_um"].to_numpy(),
-        frames=read_images(DATA / f"{image_type}-frames.tif"),
+        frames=np.asarray(open_images(DATA / f"{image_type}-frames.tif")),
         truth=pd.read_csv(DATA / "frames-truth.csv"),
     )
 
@@ -113,9 +114,9 @@ def planar_beads() -> PlanarBeads:
         )
     heights = pd.read_csv(folder / "test_frames.csv")[["frame", "z_plane_um"]].rename(columns={"z_plane_um": "z_um"})
     return PlanarBeads(
-        scan=read_images(folder / "calibration.tif"),
+        scan=np.asarray(open_images(folder / "calibration.tif")),
         z_um=pd.read_csv(folder / "calibration_z.csv")["z_um"].to_numpy(),
-        frames=read_images(folder / "test.tif"),
+        frames=np.asarray(open_images(folder / "test.tif")),
         truth=heights.merge(pd.read_csv(folder / "beads.csv"), how="cross"),
         published={p.stem: pd.read_csv(p) for p in sorted((folder / "published").glob("*.csv"))},
     )

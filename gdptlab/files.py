@@ -1,16 +1,13 @@
-"""Files: written whole or not at all, images read with care, a folder for what can be computed again."""
+"""Files: written whole or not at all, and a folder for what can be computed again."""
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
-import tifffile
-from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
 
@@ -63,54 +60,3 @@ def cache_folder() -> Path:
     folder = Path(os.environ.get("GDPTLAB_CACHE") or user_cache_path("gdptlab", appauthor=False))
     folder.mkdir(parents=True, exist_ok=True)
     return folder
-
-
-def read_images(path: str | os.PathLike[str]) -> NDArray:
-    """Read a TIFF file of one or more images.
-
-    Parameters
-    ----------
-    path : str or path-like
-
-    Returns
-    -------
-    array (n, rows, columns)
-        In the file's own type; n is 1 for a single image.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is not a TIFF, is damaged, or does not hold grey images of one size.
-    """
-    name = Path(path).name
-    try:
-        with _errors_raised(tifffile.logger()), tifffile.TiffFile(path) as file:
-            pages = len(file.pages)
-            sizes = {page.shape for page in file.pages}
-            images = file.asarray(key=range(pages))
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # of many kinds, for files that are no TIFF or are damaged
-        raise ValueError(f"path: got {name!r}, which cannot be read as a TIFF: {error}") from error
-    images = images[None] if images.ndim == 2 else images
-    if images.ndim != 3 or len(images) != pages or len(sizes) > 1:
-        raise ValueError(f"path: got {name!r} of shape {images.shape}, allowed are grey images of one size")
-    return images
-
-
-@contextmanager
-def _errors_raised(logger: logging.Logger) -> Iterator[None]:
-    """Raise what is logged as an error: tifffile only logs that a file is cut off, and returns what is left."""
-
-    class Raising(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            raise ValueError(record.getMessage())
-
-    handler = Raising(logging.ERROR)
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)

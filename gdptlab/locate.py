@@ -17,8 +17,8 @@ A particle is then measured only if its whole window lies in the frame; nothing 
 template wide. Or jointly (`overlap`): particles may overlap and be cut by the frame's edge.
 """
 
-from collections.abc import Iterable, Iterator
-from itertools import islice
+from collections.abc import Container, Iterable, Iterator
+from itertools import count, islice
 
 import cv2
 import numpy as np
@@ -30,8 +30,9 @@ from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
 from gdptlab.calibration import Calibration
-from gdptlab.check import choice, positive, real_array, whole
+from gdptlab.check import choice, flag, positive, real_array, whole
 from gdptlab.cores import on_one_core
+from gdptlab.images import Images
 from gdptlab.overlap import Explained, Overlap
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
@@ -111,12 +112,12 @@ def locate(
     ['x_px', 'y_px', 'z_um', 'cm', 'at_end']
     """
     if choice("method", method, METHODS) == "joint":
-        if (threshold, refine, min_distance_px) != (0.5, True, None):
+        if positive("threshold", threshold) != 0.5 or not flag("refine", refine) or min_distance_px is not None:
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
         return _overlapping(image, calibration, None)[0]
     image, distance = _checked(image, calibration, threshold, min_distance_px)
     place, step, cm = _candidates(image, calibration, threshold)
-    if refine:
+    if flag("refine", refine):
         place, step, cm = _refined(image, calibration, place, step)
     kept = _strongest(place, np.where(cm >= threshold, cm, 0), distance)
     place, step, cm = place[kept], step[kept], cm[kept]
@@ -327,12 +328,14 @@ def batch(
     Parameters
     ----------
     frames : iterable of arrays (rows, columns)
-        A list, a stack, a generator: read in blocks of `BLOCK` frames and at most `n_jobs` + 1 blocks ahead,
-        so that a film need not fit into memory.
+        A list, a stack, a memory map, a dask array, a generator: read in blocks of `BLOCK` frames and at most
+        `n_jobs` + 1 blocks ahead, so that a film need not fit into memory. Images of `open_images` are read by
+        the process that measures them.
     calibration : Calibration
     n_jobs : int
         Processes to spread the blocks over; -1 for one per core. The result does not depend on it. They
-        take some seconds to start, once, and stay for the next film. With method "joint" it is 1.
+        take some seconds to start, once, and stay for the next film. Under `joblib.parallel_config(backend="dask")`
+        the blocks go to all workers of the dask cluster instead. With method "joint" it is 1.
     progress : bool
         Show a progress bar.
     **settings
@@ -350,40 +353,85 @@ def batch(
     TypeError, ValueError
         As `locate`: for settings at once, for frames at the first that is refused.
     """
+    blank = blank_table(calibration, n_jobs, settings)
+    try:
+        iter(frames)
+    except TypeError as error:
+        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+    tables = [blank]
+    total = len(frames) if hasattr(frames, "__len__") else None
+    with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
+        for _, n, table in in_blocks(frames, calibration, n_jobs, settings):
+            tables.append(table)
+            bar.update(n)
+    return pd.concat(tables, ignore_index=True)[[*blank]]
+
+
+def blank_table(calibration: Calibration, n_jobs: int, settings: dict[str, object]) -> pd.DataFrame:
+    """Table of a blank frame, as from `batch`, if the arguments are what that takes.
+
+    What is wrong with the settings is refused before the film begins, and what a calibration makes only when it
+    is needed is made here, not by every process for every block.
+    """
     if n_jobs != -1:
         whole("n_jobs", n_jobs, 1, 10_000)
-    # A blank frame: what is wrong with the settings is refused before the film begins, and what a calibration
-    # makes only when it is needed is made here, not by every process for every block.
     blank = locate(np.zeros((_size(calibration),) * 2), calibration, **settings)
-    total = len(frames) if hasattr(frames, "__len__") else None
-    copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
+    if settings.get("method") == "joint" and n_jobs != 1:
+        raise ValueError(f"n_jobs: got {n_jobs}, allowed with method 'joint' is 1: a frame begins with the last")
+    return blank.assign(frame=0)[["frame", *blank]]
+
+
+def in_blocks(
+    frames: Iterable[ArrayLike],
+    calibration: Calibration,
+    n_jobs: int,
+    settings: dict[str, object],
+    done: Container[int] = (),
+) -> Iterator[tuple[int, int, pd.DataFrame]]:
+    """Measure blocks of frames: number of the first frame, how many, and their table, in order.
+
+    Blocks whose first frame is in `done` are left out. A film by the joint fit is one chain, so that what comes
+    before a missing block is measured once more; otherwise blocks know nothing of each other.
+    """
     if settings.get("method") == "joint":
-        if n_jobs != 1:
-            raise ValueError(f"n_jobs: got {n_jobs}, allowed with method 'joint' is 1: a frame begins with the last")
-        located = _followed(copies, calibration)
+        before = None
+        for first, block in _blocks(frames, ()):
+            tables = []
+            for frame in block:
+                table, before = on_one_core(_overlapping)(frame, calibration, before)
+                tables.append(table)
+            if first not in done:
+                yield first, len(tables), _numbered(tables, first)
+        return
+    jobs = (delayed(_located)(block, first, calibration, settings) for first, block in _blocks(frames, done))
+    yield from Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs)
+
+
+def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:
+    """Number of the first frame, and frames, of each block not in `done`, to be handed to a process."""
+    is_dask = hasattr(frames, "dask")
+    if isinstance(frames, Images | np.ndarray) or is_dask:
+        blocks = (frames[first : first + BLOCK] for first in range(0, len(frames), BLOCK))  # nothing is read yet
     else:
+        copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
         blocks = iter(lambda: list(islice(copies, BLOCK)), [])
-        jobs = (delayed(_located)(block, i * BLOCK, calibration, settings) for i, block in enumerate(blocks))
-        located = Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs)
-    tables = [blank.assign(frame=0)]
-    with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
-        for count, table in located:
-            tables.append(table)
-            bar.update(count)
-    return pd.concat(tables, ignore_index=True)[["frame", *blank]]
+    for first, block in zip(count(0, BLOCK), blocks, strict=False):
+        if first not in done:
+            # A list goes along with its task; an array a cluster would put on one worker, and lose with it.
+            if not isinstance(block, Images):
+                block = list(block.compute(scheduler="synchronous") if is_dask else block)
+            yield first, block
 
 
 def _located(
-    block: list[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
-) -> tuple[int, pd.DataFrame]:
-    """How many frames are in a block that begins with number `first`, and what is in them."""
-    tables = [locate(frame, calibration, **settings).assign(frame=i) for i, frame in enumerate(block, first)]
-    return len(block), pd.concat(tables, ignore_index=True)
+    block: Iterable[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
+) -> tuple[int, int, pd.DataFrame]:
+    """Number of the first frame of a block, how many there are, and what is in them."""
+    tables = [locate(frame, calibration, **settings) for frame in block]
+    return first, len(tables), _numbered(tables, first)
 
 
-def _followed(frames: Iterable[NDArray], calibration: Calibration) -> Iterator[tuple[int, pd.DataFrame]]:
-    """1, and the table of the joint fit, for each frame of a film."""
-    before = None
-    for i, frame in enumerate(frames):
-        table, before = on_one_core(_overlapping)(frame, calibration, before)
-        yield 1, table.assign(frame=i)
+def _numbered(tables: list[pd.DataFrame], first: int) -> pd.DataFrame:
+    """Tables of consecutive frames as one, with the number of each frame."""
+    table = pd.concat([table.assign(frame=i) for i, table in enumerate(tables, first)], ignore_index=True)
+    return table[["frame", *table.columns.drop("frame")]]

@@ -112,7 +112,8 @@ class Overlap:
 
     def first(self, frame: NDArray[np.float32]) -> Explained:
         """Explain a frame (rows, columns) of which nothing is known."""
-        noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame))) or 1.0  # a blank frame has none
+        noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame)))
+        noise = noise if noise > 1e-15 else 1.0  # a blank frame has none, or one whose square is lost in float32
         places, brightness = self._search(self._reduced(frame), noise)
         places[:, :2] *= self._scale
         spread, variance, behind = KNOWN * brightness, np.array([0, 0, noise**2]), None

@@ -1,10 +1,15 @@
 """Microscope, calibrations and frames that many tests share; each is made once."""
 
+import os
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from gdptlab import Calibration, Microscope
+
+THOROUGH = bool(os.environ.get("GDPTLAB_THOROUGH"))
+"""Whether tests that can be made longer are: `GDPTLAB_THOROUGH=1 pytest tests/test_stream.py`, some minutes each."""
 
 Z_UM = np.linspace(-50, 50, 51)
 SIZE_PX = 61

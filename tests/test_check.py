@@ -66,6 +66,11 @@ def test_real_array_gives_float32_of_any_real_type(dtype):
     [
         ([1, 2], ValueError, r"got shape \(2,\), allowed are 2 axes, none of them empty"),
         (np.zeros((0, 3)), ValueError, r"got shape \(0, 3\)"),
+        (
+            np.zeros((4, 5, 3)),
+            ValueError,
+            r"got shape .*; for a colour image take one channel, as in image",
+        ),
         ([[1j]], TypeError, "got values of type complex128, allowed are real numbers"),
         ([["a"]], TypeError, "got values of type <U1"),
         ([[None]], TypeError, "got values of type object"),

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from gdptlab import Calibration, batch, datasets, locate, match
-from gdptlab.files import read_images
+from gdptlab.images import open_images
 from gdptlab.imagetypes import IMAGE_TYPES
 
 # Found and RMSE of z in µm of published methods on the planar beads, by the score of `score`.
@@ -54,7 +54,7 @@ def test_samples_can_be_made_again(microscope, tmp_path):
         if name.endswith(".csv"):
             pd.testing.assert_frame_equal(pd.read_csv(tmp_path / name), pd.read_csv(datasets.DATA / name))
         else:
-            one, other = (read_images(folder / name).astype(int) for folder in (tmp_path, datasets.DATA))
+            one, other = (np.asarray(open_images(folder / name), int) for folder in (tmp_path, datasets.DATA))
             assert one.shape == other.shape
             assert np.abs(one - other).max() <= 1 and (one != other).mean() < 0.01
 

@@ -2,11 +2,9 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-import tifffile
 
-from gdptlab.files import cache_folder, read_images, written_whole
+from gdptlab.files import cache_folder, written_whole
 
 
 def test_content_arrives_under_the_name_asked_for(tmp_path: Path) -> None:
@@ -49,62 +47,6 @@ def test_no_folder_is_created(tmp_path: Path) -> None:
 def test_writing_nothing_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), written_whole(tmp_path / "stack.tif"):
         pass
-
-
-# -------------------- reading images
-
-
-@pytest.mark.parametrize("shape", [(9, 14), (1, 9, 14), (5, 9, 14)])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-@pytest.mark.parametrize("compression", [None, "zlib"])
-def test_images_come_back_as_they_were(tmp_path, shape, dtype, compression):
-    images = (np.random.default_rng(1).random(shape) * 200).astype(dtype)
-    tifffile.imwrite(tmp_path / "a.tif", images, compression=compression, photometric="minisblack")
-    read = read_images(str(tmp_path / "a.tif"))
-    assert read.dtype == dtype
-    np.testing.assert_array_equal(read, images.reshape(-1, 9, 14))
-
-
-def test_no_such_image(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_images(tmp_path / "absent.tif")
-
-
-@pytest.mark.parametrize("content", [b"", b"II*", b"not a tiff, though named so", bytes(1000)])
-def test_not_a_tiff(tmp_path, content):
-    path = tmp_path / "a.tif"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"^path: got 'a.tif', which cannot be read as a TIFF: "):
-        read_images(path)
-
-
-@pytest.mark.parametrize("compression", [None, "zlib"])
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.7, 0.99])
-def test_truncated_tiff(tmp_path, compression, share):
-    path = tmp_path / "a.tif"
-    images = np.random.default_rng(1).integers(0, 4000, (6, 40, 50), np.uint16)
-    tifffile.imwrite(path, images, compression=compression, photometric="minisblack")
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ValueError, match=r"^path: got 'a.tif'"):
-        read_images(path)
-
-
-@pytest.mark.parametrize("pages", [1, 3])
-def test_colour_is_refused(tmp_path, pages):
-    path = tmp_path / "a.tif"
-    tifffile.imwrite(path, np.zeros((pages, 20, 30, 3), np.uint8), photometric="rgb")
-    with pytest.raises(ValueError, match=r"^path: got 'a.tif' of shape .*, allowed are grey images of one size"):
-        read_images(path)
-
-
-def test_images_of_several_sizes_are_refused(tmp_path):
-    path = tmp_path / "a.tif"
-    with tifffile.TiffWriter(path) as file:
-        for n in (20, 21):
-            file.write(np.zeros((n, 30), np.uint8), photometric="minisblack")
-    with pytest.raises(ValueError, match=r"^path: got 'a.tif'"):
-        read_images(path)
 
 
 # -------------------- the cache's folder

@@ -415,6 +415,12 @@ def test_batch_of_no_frames(calibration, frames):
     assert_columns(measured, {"frame": "int64"})
 
 
+@pytest.mark.parametrize("frames", [None, 3, np.array(2.5)])
+def test_batch_of_what_is_no_film(calibration, frames):
+    with pytest.raises(TypeError, match=r"^frames: got a \w+, allowed is an iterable of arrays"):
+        batch(frames, calibration, progress=False)
+
+
 def test_batch_passes_settings_on(few, calibration):
     measured = batch([few[0]], calibration, progress=False, refine=False, threshold=0.9)
     pd.testing.assert_frame_equal(

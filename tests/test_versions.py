@@ -16,7 +16,7 @@ def test_names_every_direct_dependency() -> None:
     with (Path(__file__).parents[1] / "pyproject.toml").open("rb") as file:
         project = tomllib.load(file)["project"]
     requirements = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
-    names = [re.split("[<>=~]", requirement)[0] for requirement in requirements]
+    names = [re.split(r"[\[<>=~]", requirement)[0] for requirement in requirements]
     found = versions()
     assert list(found) == ["gdptlab", "python", "platform", *names]
     assert found["gdptlab"] == project["version"]

@@ -1,0 +1,345 @@
+"""Whatever comes in: a result without NaN, or an error that names the argument. Never a crash, a warning or silence.
+
+A few tries of each function; `GDPTLAB_THOROUGH=1 pytest tests/test_hostile_input.py` makes it 2000 each.
+"""
+
+import re
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import tifffile
+from conftest import THOROUGH
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from gdptlab import Calibration, batch, locate, match
+from gdptlab.assess import scores, scores_by_z
+from gdptlab.datasets import DATA
+from gdptlab.images import open_images, open_scan
+from gdptlab.stream import batch_to_parquet
+from gdptlab.tables import in_um, save_points, save_table
+
+tried = settings(
+    max_examples=2000 if THOROUGH else 60,
+    deadline=None,
+    derandomize=not THOROUGH,
+    database=None,
+    phases=[Phase.generate] if not THOROUGH else [Phase.generate, Phase.shrink],
+    suppress_health_check=list(HealthCheck),
+)
+
+Z_UM = np.linspace(-3, 3, 7)
+
+
+def disc(z_um, y_px=0.0, x_px=0.0, shape=(9, 9)):
+    """A particle: a spot that grows along z, wider along x below and along y above."""
+    y, x = np.indices(shape) - np.reshape(np.array(shape) // 2, (2, 1, 1))
+    wide, high = 1 + 0.2 * (z_um - 3) ** 2 / 9, 1 + 0.2 * (z_um + 3) ** 2 / 9
+    return np.exp(-(((x - x_px) / wide) ** 2) - ((y - y_px) / high) ** 2)
+
+
+STACK = np.stack([disc(z) for z in Z_UM]) + np.random.default_rng(1).normal(0, 0.01, (7, 9, 9))
+CALIBRATION = Calibration.from_stack(STACK, Z_UM, n_sub=3)
+
+
+ANY_DIMS, ANY_SIDE = st.integers(0, 4), st.integers(0, 24)
+LAYOUTS = ("plain", "read-only", "Fortran", "backwards", "strided", "map", "list")
+
+
+@st.composite
+def arrays(draw, dims=ANY_DIMS, side=ANY_SIDE):
+    """Arrays of any shape, type, content and place in memory."""
+    shape = tuple(draw(st.lists(side, min_size=(n := draw(dims)), max_size=n)))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    kind = draw(st.sampled_from(["noise", "particles", "constant", "zero", "sparse", "ramp"]))
+    values = {
+        "noise": lambda: rng.normal(size=shape),
+        "particles": lambda: particles(rng, shape),
+        "constant": lambda: np.full(shape, rng.normal()),
+        "zero": lambda: np.zeros(shape),
+        "sparse": lambda: (rng.random(shape) < 0.02).astype(float),
+        "ramp": lambda: np.arange(np.prod(shape, dtype=int), dtype=float).reshape(shape),
+    }[kind]()
+    values = values * draw(st.sampled_from([1, 1, 100, 1e-30, 1e-45, 1e15, 1e38, 1e300])) + draw(
+        st.sampled_from([0, 0, 1, -1e3, 1e9, 1e38, -1e38])
+    )
+    for odd in draw(st.lists(st.sampled_from([np.nan, np.inf, -np.inf, 1e308, 3e38, -0.0]), max_size=2)):
+        if values.size:
+            values.flat[rng.integers(values.size)] = odd
+    dtype = draw(st.sampled_from("f8 f8 f4 f2 >f4 u1 u2 >u2 i2 i8 ? c8 O U M8[s]".split()))
+    with np.errstate(all="ignore"):
+        values = np.nan_to_num(values).astype("i8") if dtype == "M8[s]" else values
+        array = values.astype("u8" if dtype in ("u1", "u2", ">u2") else dtype).astype(dtype)
+    return placed(array, draw(st.sampled_from(LAYOUTS)))
+
+
+def particles(rng, shape):
+    """Images with particles here and there."""
+    if len(shape) < 2:
+        return rng.normal(size=shape)
+    image = rng.normal(0, 0.02, shape)
+    for _ in range(3):
+        y, x = rng.uniform(-0.5, 0.5, 2) * shape[-2:]
+        image += disc(rng.uniform(-3, 3), y, x, shape[-2:])
+    return image
+
+
+def placed(array, layout):
+    if layout == "read-only":
+        array = np.array(array)
+        array.flags.writeable = False
+    elif layout == "Fortran":
+        array = np.asfortranarray(array)
+    elif layout == "backwards":
+        turn = (slice(None, None, -1),) * array.ndim
+        array = array[turn].copy()[turn]
+    elif layout == "strided" and array.ndim:
+        array = np.repeat(array, 2, axis=-1)[..., ::2]
+    elif layout == "map" and array.size and not array.dtype.hasobject:
+        with tempfile.TemporaryFile() as file:
+            file.write(array.tobytes())
+            file.flush()
+            array = np.memmap(file, array.dtype, "r", shape=array.shape)
+    elif layout == "list":
+        array = array.tolist()
+    return array
+
+
+ODD = [None, np.nan, np.inf, -1, 0, 1, 2, 3, 0.5, 1e-320, 1e308, 10**30, "a", True, 1j, [], [1, 2], np.float32(0.5)]
+ODD += [np.int8(3), np.array(2.0), np.array([1.0, 2.0]), {}, object, np.datetime64("NaT"), 2.5, 5, 7]
+odd = st.sampled_from(ODD)
+some_images = arrays(dims=st.sampled_from([2, 2, 2, 1, 3]), side=st.integers(0, 40) | st.integers(9, 40))
+
+
+def some(*names):
+    """A few of the arguments of these names, odd ones."""
+    return st.fixed_dictionaries({}, optional=dict.fromkeys(names, odd))
+
+
+def fails_by_name(call, *names):
+    """What a call returns, or None if it raises an error of a promised type that begins with an argument's name."""
+    try:
+        return call()
+    except (TypeError, ValueError, FileNotFoundError) as error:
+        assert re.match(rf"({'|'.join(names)})\b", str(error)), f"{type(error).__name__}: {error}"
+        return None
+
+
+def assert_sound(table, frames=None):
+    """Numbers in all columns, and places in the frame."""
+    assert isinstance(table, pd.DataFrame)
+    assert np.isfinite(table.astype(float)).all(axis=None)
+    assert (table["cm"] <= 1).all() and table["z_um"].between(-3, 3).all()
+    if frames is not None:
+        rows, columns = np.shape(frames)[-2:]
+        assert table["x_px"].between(-0.5, columns - 0.5).all() and table["y_px"].between(-0.5, rows - 0.5).all()
+
+
+LOCATE = ("method", "threshold", "refine", "min_distance_px")
+
+
+@tried
+@given(image=some_images, given=some(*LOCATE[1:]))
+def test_locate(image, given):
+    found = fails_by_name(lambda: locate(image, CALIBRATION, **given), "image", *LOCATE)
+    if found is not None:
+        assert_sound(found, image)
+
+
+@tried
+@given(image=some_images)
+def test_locate_jointly(image):
+    found = fails_by_name(lambda: locate(image, CALIBRATION, method="joint"), "image")
+    if found is not None:
+        assert_sound(found, image)
+
+
+@tried
+@given(calibration=odd, method=odd)
+def test_locate_with_odd_calibration_and_method(calibration, method):
+    fails_by_name(lambda: locate(np.eye(20), calibration), "calibration")
+    fails_by_name(lambda: locate(np.eye(20), CALIBRATION, method=method), "method")
+
+
+@tried
+@given(frames=arrays(side=st.integers(0, 30)) | st.lists(some_images, max_size=3) | odd, given=some("n_jobs", *LOCATE))
+def test_batch(frames, given):
+    if str(given.get("n_jobs", 1)) in "1 -1 0 nan":  # processes take seconds
+        call = lambda: batch(frames, CALIBRATION, progress=False, **given)  # noqa: E731
+        found = fails_by_name(call, "image", "frames", "n_jobs", *LOCATE)
+        if found is not None:
+            assert_sound(found)
+
+
+stacks = arrays(dims=st.just(3), side=st.sampled_from([3, 5, 7, 7, 7, 9, 8, 0])) | arrays() | st.just(STACK) | odd
+depths = arrays(dims=st.just(1), side=st.integers(0, 9)) | st.integers(0, 9).map(np.arange) | st.just(Z_UM) | odd
+
+
+def assert_sound_calibration(made):
+    assert np.isfinite(made.templates).all() and np.isfinite(made.expected).all() and np.isfinite(made.z_um).all()
+    if made.size <= 9:
+        assert np.isfinite(locate(STACK[3], made).astype(float)).all(axis=None)
+
+
+@tried
+@given(stack=stacks, z_um=depths, given=some("n_sub", "n", "denoise"))
+def test_from_stack(stack, z_um, given):
+    made = fails_by_name(lambda: Calibration.from_stack(stack, z_um, **given), "stack", "z_um", "n_sub", "n", "denoise")
+    if made is not None:
+        assert_sound_calibration(made)
+
+
+@tried
+@given(size=st.sampled_from([3, 5, 7, 9]), data=st.data())
+def test_from_stacks_that_fit(size, data):
+    """More of those that are not refused at once."""
+    stack = data.draw(arrays(dims=st.just(3), side=st.just(size)))
+    made = fails_by_name(lambda: Calibration.from_stack(stack, range(size), n_sub=2), "stack", "z_um", "n_sub")
+    if made is not None:
+        assert_sound_calibration(made)
+
+
+@tried
+@given(
+    scan=arrays(dims=st.sampled_from([3, 3, 3, 2]), side=st.sampled_from([7, 12, 25, 0])) | odd,
+    z_um=depths,
+    x_px=st.floats(0, 12) | odd,
+    y_px=st.floats(0, 12) | odd,
+    given=some("size", "n_sub", "n", "denoise"),
+)
+def test_from_scan(scan, z_um, x_px, y_px, given):
+    names = ("scan", "stack", "z_um", "x_px", "y_px", "size", "n_sub", "n", "denoise")
+    fit = isinstance(scan, np.ndarray) and scan.ndim == 3
+    z_um = np.arange(len(scan)) if fit and isinstance(z_um, np.ndarray) else z_um
+    made = fails_by_name(lambda: Calibration.from_scan(scan, z_um, x_px, y_px, **given), *names)
+    if made is not None:
+        assert_sound_calibration(made)
+
+
+# -------------------- tables
+
+
+@st.composite
+def tables(draw):
+    """Tables of particles, whole or odd."""
+    n = draw(st.integers(0, 6))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    columns = {name: rng.uniform(-9, 9, n) for name in ("x_px", "y_px", "z_um")}
+    columns["frame"] = rng.integers(0, 3, n)
+    for name in draw(st.sets(st.sampled_from([*columns, "x_std_px"]), max_size=2)):
+        kind = draw(st.sampled_from(["absent", "nan", "inf", "text", "object", "huge", "bool", "int", "complex"]))
+        if kind == "absent":
+            columns.pop(name, None)
+        elif kind in ("nan", "inf", "huge"):
+            columns[name] = rng.choice([1.0, {"nan": np.nan, "inf": np.inf, "huge": 1e308}[kind]], n)
+        else:
+            value = {"text": "a", "object": None, "bool": True, "int": 3, "complex": 1j}[kind]
+            columns[name] = pd.Series([value] * n, dtype=object if kind in ("text", "object") else None)
+    table = pd.DataFrame(columns)
+    table.index = draw(st.sampled_from([range(n), [0] * n, range(n, 0, -1), [*"abcdef"[:n]]]))
+    return draw(st.sampled_from([table] * 9 + [None, columns, 3, table.get("x_px")]))
+
+
+WITHIN = ("measured", "true", "within_px", "within_um")
+
+
+@tried
+@given(measured=tables(), true=tables(), given=some(*WITHIN[2:]))
+def test_match_and_scores(measured, true, given):
+    pairs = fails_by_name(lambda: match(measured, true, **given), *WITHIN)
+    summary = fails_by_name(lambda: scores(measured, true, **given), *WITHIN)
+    assert (pairs is None) == (summary is None)
+    if pairs is not None:
+        assert np.isfinite(pairs[["dx_px", "dy_px", "dz_um", "z_um"]].astype(float)).all(axis=None)
+        assert pairs["measured"].is_unique and pairs["true"].is_unique
+        assert summary["n_matched"] == len(pairs)
+
+
+@tried
+@given(measured=tables(), true=tables(), edges_um=arrays(dims=st.just(1), side=st.integers(0, 4)) | odd)
+def test_scores_by_z(measured, true, edges_um):
+    fails_by_name(lambda: scores_by_z(measured, true, edges_um), *WITHIN, "edges_um")
+
+
+@tried
+@given(table=tables(), um_per_px=odd, program=st.sampled_from(["napari", "imagej"]) | odd, given=some("a", "b"))
+def test_tables_out(table, um_per_px, program, given):
+    with tempfile.TemporaryDirectory() as folder:
+        fails_by_name(lambda: in_um(table, um_per_px), "table", "um_per_px")
+        path = Path(folder) / "a.csv"
+        call = lambda: save_points(table, path, program, um_per_px=um_per_px)  # noqa: E731
+        fails_by_name(call, "table", "program", "um_per_px")
+        fails_by_name(lambda: save_table(table, path, CALIBRATION, **given), "table", "settings")
+        fails_by_name(
+            lambda: save_table(table, path.with_suffix(".parquet"), CALIBRATION, **given), "table", "settings"
+        )
+        assert {p.name for p in Path(folder).iterdir()} <= {"a.csv", "a.csv.json", "a.parquet", "a.parquet.json"}
+
+
+@tried
+@given(path=odd | st.sampled_from(["absent", "*", "a\0b", "[", "a/b/c.tif", "/", "~", "a" * 5000]), csv=odd)
+def test_odd_paths(path, csv):
+    fails_by_name(lambda: open_images(path), "path")
+    fails_by_name(lambda: open_scan(path, csv=csv), "path", "csv")
+    scan = DATA / "brightfield-frames.tif"
+    fails_by_name(lambda: open_scan(scan, csv=csv, names=path), "path", "csv", "names", "start_um")
+
+
+# -------------------- files
+
+
+@st.composite
+def files(draw):
+    """The bytes of a TIFF, with damage."""
+    images = draw(arrays(dims=st.sampled_from([2, 3, 3, 4]), side=st.integers(1, 12)))
+    images = np.asarray(images)
+    if images.dtype.kind not in "uif":
+        images = np.zeros((3, 9, 9), np.uint8)
+    options = {"compression": draw(st.sampled_from([None, "zlib", "lzw", "packbits"])), "photometric": "minisblack"}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.tif")
+        with suppress(Exception):
+            tifffile.imwrite(path, images, **options)
+        content = bytearray(path.read_bytes()) if path.exists() else bytearray()
+    for place, byte in draw(st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), max_size=3)):
+        if content:
+            content[int(place * (len(content) - 1))] = byte
+    return bytes(content[: int(draw(st.sampled_from([1, 1, 1, 0.9, 0.5, 0.01])) * len(content))])
+
+
+@tried
+@given(content=files(), start=odd, step=odd)
+def test_damaged_files(content, start, step):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.tif")
+        path.write_bytes(content)
+        images = fails_by_name(lambda: open_images(path), "path")
+        if images is not None and np.prod(images.shape) < 1e6:
+            read = fails_by_name(lambda: np.asarray(images), "path")
+            assert read is None or read.shape == images.shape
+        fails_by_name(lambda: open_scan(path, start_um=start, step_um=step), "path", "start_um", "step_um", "names")
+
+
+@tried
+@given(frames=arrays(dims=st.sampled_from([3, 3, 2, 4]), side=st.integers(0, 20)) | odd, given=some(*LOCATE))
+def test_batch_to_parquet(frames, given):
+    with tempfile.TemporaryDirectory() as folder:
+        names = ("frames", "path", "image", "settings", *LOCATE)
+        call = lambda: batch_to_parquet(frames, CALIBRATION, Path(folder, "out"), progress=False, **given)  # noqa: E731
+        if fails_by_name(call, *names) is not None:
+            assert_sound(pd.read_parquet(Path(folder, "out")))
+
+
+@tried
+@given(cut=st.floats(0, 1), place=st.floats(0, 1), byte=st.integers(0, 255))
+def test_damaged_calibrations(cut, place, byte):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.npz")
+        CALIBRATION.save(path)
+        content = bytearray(path.read_bytes())
+        content[int(place * (len(content) - 1))] = byte
+        path.write_bytes(content[: int(cut * len(content))] if byte % 2 else content)
+        fails_by_name(lambda: Calibration.load(path), "path")

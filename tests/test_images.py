@@ -1,0 +1,365 @@
+"""Images come out of files as they went in, in the right order, and only when they are asked for."""
+
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+import tifffile
+
+from gdptlab import batch
+from gdptlab.images import Images, open_images, open_scan
+
+FILM = np.random.default_rng(1).integers(0, 200, (12, 9, 14), dtype=np.uint8)
+
+
+def write(path, images, **options):
+    tifffile.imwrite(path, images, **{"photometric": "minisblack"} | options)
+    return path
+
+
+def assert_holds(images, expected):
+    assert isinstance(images, Images)
+    assert images.shape == expected.shape and images.dtype == expected.dtype
+    read = np.asarray(images)
+    assert read.dtype == expected.dtype
+    np.testing.assert_array_equal(read, expected)
+
+
+@pytest.mark.parametrize("shape", [(9, 14), (1, 9, 14), (5, 9, 14), (3, 9, 14)])
+@pytest.mark.parametrize("dtype", ["u1", "u2", ">u2", "f4", "f8", "i2", "u4"])
+@pytest.mark.parametrize("compression", [None, "zlib", "lzw"])
+def test_images_come_back_as_they_were(tmp_path, shape, dtype, compression):
+    images = (np.random.default_rng(1).random(shape) * 200).astype(dtype)
+    order = ">" if dtype[0] == ">" else None
+    path = write(tmp_path / "a.tif", images, compression=compression, byteorder=order)
+    expected = images.reshape(-1, 9, 14).astype(images.dtype.newbyteorder("="))
+    assert_holds(open_images(str(path)), expected)
+    assert_holds(open_images(path)[1:4], expected[1:4])
+    np.testing.assert_array_equal(open_images(path)[-1], expected[-1])
+
+
+def in_a_loop(path):
+    with tifffile.TiffWriter(path) as file:
+        for image in FILM:
+            file.write(image, photometric="minisblack")
+
+
+def pages(path):
+    with tifffile.TiffWriter(path) as file:
+        for image in FILM:
+            file.write(image, photometric="minisblack", metadata=None)
+
+
+KINDS = {
+    "one by one": in_a_loop,
+    "pages": pages,
+    "ImageJ": lambda path: write(path, FILM, imagej=True, photometric=None),
+    "ImageJ beyond 4 GB": lambda path: write(path, FILM, imagej=True, photometric=None, truncate=True),
+    "big": lambda path: write(path, FILM, bigtiff=True),
+    "tiles": lambda path: write(path, FILM, tile=(16, 16), compression="zlib"),
+    "predictor": lambda path: write(path, FILM, predictor=True, compression="zlib"),
+    "inverted": lambda path: write(path, FILM, photometric="miniswhite"),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_kind_of_tiff(tmp_path, kind):
+    path = tmp_path / "a.tif"
+    KINDS[kind](path)
+    assert_holds(open_images(path), FILM)
+    assert_holds(open_images(path)[[7, 2]], FILM[[7, 2]])
+
+
+def test_packed_12_bit(tmp_path):
+    """As some cameras save them: two pixels in three bytes."""
+    images = np.random.default_rng(2).integers(0, 4096, (3, 8, 10), dtype=np.uint16)
+    path = write(tmp_path / "a.tif", images, bitspersample=12)
+    assert_holds(open_images(path), images)
+
+
+@pytest.mark.parametrize("axes", ["TYX", "ZYX"])
+def test_ome(tmp_path, axes):
+    metadata = {"axes": axes, "PhysicalSizeX": 650.0, "PhysicalSizeXUnit": "nm", "PhysicalSizeY": 0.65}
+    path = write(tmp_path / "a.ome.tif", FILM, metadata=metadata)
+    assert_holds(open_images(path), FILM)
+    assert open_images(path).um_per_px == open_images(path)[2:4].um_per_px == pytest.approx(0.65)
+
+
+def ome_set(folder):
+    """A film in two OME-TIFFs that know of each other."""
+    ids = "urn:uuid:00000000-0000-0000-0000-00000000000"
+    planes = "".join(
+        f'<TiffData FirstT="{t}" IFD="{t % 6}" PlaneCount="1"><UUID FileName="f{t // 6}.ome.tif">{ids}{t // 6}</UUID>'
+        "</TiffData>"
+        for t in range(12)
+    )
+    for k in range(2):
+        xml = (
+            f'<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="{ids}{k}"><Image ID="Image:0">'
+            '<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint8" SizeX="14" SizeY="9" SizeZ="1" SizeC="1" '
+            f'SizeT="12">{planes}</Pixels></Image></OME>'
+        )
+        write(folder / f"f{k}.ome.tif", FILM[6 * k : 6 * k + 6], description=xml, metadata=None)
+
+
+def test_ome_of_several_files(tmp_path):
+    ome_set(tmp_path)
+    assert_holds(open_images(tmp_path / "f0.ome.tif"), FILM)
+    assert_holds(open_images(tmp_path), FILM)
+    assert open_images(tmp_path)[[5, 6]].names == ["f0.ome.tif", "f1.ome.tif"]
+    (tmp_path / "f1.ome.tif").unlink()
+    with pytest.raises((ValueError, FileNotFoundError)):
+        np.asarray(open_images(tmp_path / "f0.ome.tif"))
+
+
+def test_um_per_px_of_imagej(tmp_path):
+    path = write(
+        tmp_path / "a.tif", FILM, imagej=True, photometric=None, resolution=(1 / 0.325,) * 2, metadata={"unit": "um"}
+    )
+    assert open_images(path).um_per_px == pytest.approx(0.325)
+    assert open_images(write(tmp_path / "b.tif", FILM, resolution=(72, 72))).um_per_px is None
+
+
+# -------------------- folders
+
+
+def test_folder_in_natural_order(tmp_path):
+    for k, image in enumerate(FILM):
+        write(tmp_path / f"Frame{k}.{'TIF' if k % 2 else 'tiff'}", image)
+    (tmp_path / "notes.txt").write_text("not an image")
+    (tmp_path / ".hidden.tif").write_text("nor this")
+    images = open_images(tmp_path)
+    assert_holds(images, FILM)
+    assert images.names[:3] == ["Frame0.tiff", "Frame1.TIF", "Frame2.tiff"]
+
+
+def test_folder_of_stacks(tmp_path):
+    for k in range(3):
+        write(tmp_path / f"part{10 * k}.tif", FILM[4 * k : 4 * k + 4], compression="zlib" if k == 1 else None)
+    assert_holds(open_images(tmp_path), FILM)
+
+
+def test_pattern(tmp_path):
+    for k in range(3):
+        write(tmp_path / f"{k}_green.tif", FILM[k])
+        write(tmp_path / f"{k}_red.tif", FILM[k + 3])
+    assert_holds(open_images(tmp_path / "*_red.tif"), FILM[3:6])
+
+
+def test_a_folder_is_not_read_before_it_is_asked_for(tmp_path):
+    for k in range(3):
+        write(tmp_path / f"{k}.tif", FILM[k])
+    (tmp_path / "7.tif").write_text("damaged")
+    images = open_images(tmp_path)
+    assert len(images) == 4
+    assert_holds(images[:3], FILM[:3])
+    with pytest.raises(ValueError, match=r"^path: got '7.tif', which cannot be read as a TIFF"):
+        images[3]
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (FILM[0, :8], r"'2.tif' with an image of \(8, 14\) uint8, allowed as in the others \(9, 14\) uint8"),
+        (FILM[0].astype(np.uint16), r"'2.tif' with an image of \(9, 14\) uint16"),
+        (FILM[:2], "'2.tif', which cannot be read as a TIFF: it holds 2 images, where the first file holds one"),
+    ],
+)
+def test_files_that_differ(tmp_path, other, message):
+    write(tmp_path / "1.tif", FILM[0])
+    write(tmp_path / "2.tif", other)
+    with pytest.raises(ValueError, match=f"^path: got {message}"):
+        np.asarray(open_images(tmp_path))
+
+
+def test_stacks_that_differ(tmp_path):
+    write(tmp_path / "1.tif", FILM)
+    write(tmp_path / "2.tif", FILM[:, :8])
+    with pytest.raises(ValueError, match=r"^path: got '2.tif' with another size or type than '1.tif'"):
+        open_images(tmp_path)
+
+
+# -------------------- a sequence
+
+
+def test_sequence(tmp_path):
+    images = open_images(write(tmp_path / "a.tif", FILM))
+    assert len(images) == 12 and images.shape == (12, 9, 14)
+    np.testing.assert_array_equal(np.stack(list(images)), FILM)
+    for index in (slice(2, 9, 3), slice(None, None, -1), [3, 1, 1], np.arange(12) % 3 == 0, slice(0, 0)):
+        assert_holds(images[index], FILM[index])
+    np.testing.assert_array_equal(images[-2], FILM[-2])
+    np.testing.assert_array_equal(np.asarray(images, np.float32), FILM.astype(np.float32))
+    with pytest.raises(IndexError):
+        images[12]
+    with pytest.raises(TypeError, match=r"^index: got"):
+        images[0, 3]
+    with pytest.raises(ValueError, match=r"^copy: got False"):
+        np.asarray(images, copy=False)
+    assert repr(images) == "<12 images of 9 by 14 px, uint8, in 1 files>"
+
+
+def test_other_processes_get_names_and_no_pixels(tmp_path):
+    write(tmp_path / "a.tif", np.zeros((40, 300, 300)), compression="zlib")
+    images = open_images(tmp_path / "a.tif")
+    list(zip(range(3), images, strict=False))  # in the middle of reading
+    sent = pickle.dumps(images)
+    assert len(sent) < 3000
+    assert_holds(pickle.loads(sent), np.zeros((40, 300, 300)))
+
+
+def test_a_slice_knows_only_its_own_files(tmp_path):
+    for k in range(12):
+        write(tmp_path / f"{k}.tif", FILM[k])
+    assert len(pickle.dumps(open_images(tmp_path)[3:5])) < len(pickle.dumps(open_images(tmp_path))) - 200
+
+
+# -------------------- what is refused
+
+
+def test_no_such_image(tmp_path):
+    for path in (tmp_path / "absent.tif", tmp_path, tmp_path / "*.tif", tmp_path / "absent" / "*.tif"):
+        with pytest.raises(FileNotFoundError):
+            open_images(path)
+
+
+@pytest.mark.parametrize("path", [None, 3, FILM, [FILM]])
+def test_no_path(path):
+    with pytest.raises(TypeError, match=r"^path: got a"):
+        open_images(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"II*", b"not a tiff, though named so", bytes(1000)])
+def test_not_a_tiff(tmp_path, content):
+    path = tmp_path / "a.tif"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"^path: got 'a.tif', which cannot be read as a TIFF: "):
+        open_images(path)
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.7, 0.99])
+def test_truncated_tiff(tmp_path, compression, share):
+    path = tmp_path / "a.tif"
+    images = np.random.default_rng(1).integers(0, 4000, (6, 40, 50), np.uint16)
+    whole = write(path, images, compression=compression).read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match=r"^path: got 'a.tif'"):
+        np.asarray(open_images(path))
+
+
+@pytest.mark.parametrize("shape", [(20, 30, 3), (1, 20, 30, 3), (3, 20, 30, 3), (20, 30, 4), (4, 3, 20, 30)])
+def test_colour_is_refused_with_advice(tmp_path, shape):
+    path = write(
+        tmp_path / "a.tif",
+        np.zeros(shape, np.uint8),
+        photometric="rgb",
+        planarconfig="separate" if shape[1] == 3 else "contig",
+    )
+    with pytest.raises(ValueError, match=r"^path: got 'a.tif' with images of shape .*, allowed are grey.*channel"):
+        open_images(path)
+
+
+def test_channels_and_times_are_refused_with_advice(tmp_path):
+    path = write(tmp_path / "a.ome.tif", FILM.reshape(6, 2, 9, 14), metadata={"axes": "TCYX"})
+    with pytest.raises(ValueError, match=r"^path: got 'a.ome.tif' .* axes TCYX .*save a film for each channel"):
+        open_images(path)
+
+
+def test_images_of_several_sizes_are_refused(tmp_path):
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as file:
+        for n in (20, 21):
+            file.write(np.zeros((n, 30), np.uint8), photometric="minisblack")
+    with pytest.raises(ValueError, match=r"^path: got 'a.tif'"):
+        open_images(path)
+
+
+def test_complex_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"^path: got 'a.tif' .*complex64"):
+        open_images(write(tmp_path / "a.tif", np.zeros((4, 9, 14), np.complex64)))
+
+
+# -------------------- scans
+
+
+def test_depths_from_start_and_step(tmp_path):
+    path = write(tmp_path / "a.tif", FILM)
+    images, z_um = open_scan(path, start_um=-5, step_um=0.5)
+    np.testing.assert_allclose(z_um, np.arange(-5, 1, 0.5))
+    assert_holds(images, FILM)
+    images, z_um = open_scan(path, start_um=5, step_um=-2)
+    np.testing.assert_allclose(z_um, np.arange(-17, 6, 2))
+    assert_holds(images, FILM[::-1])
+
+
+def test_depths_from_a_table(tmp_path):
+    path = write(tmp_path / "a.tif", FILM[:4])
+    pd.DataFrame({"image": range(4), "z_um": [3.5, -1, 0.25, 9]}).to_csv(tmp_path / "z.csv")
+    images, z_um = open_scan(path, csv=tmp_path / "z.csv")
+    assert z_um.tolist() == [-1, 0.25, 3.5, 9]
+    assert_holds(images, FILM[[1, 2, 0, 3]])
+
+
+@pytest.mark.parametrize(
+    "form", ["z{:g}.tif", "2023-11-05_z_{:g}um_ch1.tif", "{:+.2f}.tif", "scan z={:.1f} exp10ms.tiff"]
+)
+def test_depths_from_names(tmp_path, form):
+    depths = [10, -10, 0, 2.5, -2.5, 100]
+    for z, image in zip(depths, FILM, strict=False):
+        write(tmp_path / form.format(z), image)
+    images, z_um = open_scan(tmp_path)
+    assert z_um.tolist() == sorted(depths)
+    assert_holds(images, FILM[np.argsort(depths)])
+
+
+def test_depths_from_names_by_a_pattern(tmp_path):
+    for k, z in enumerate((-30, -20, -10)):
+        write(tmp_path / f"{3 - k}-z{z}.tif", FILM[k])
+    images, z_um = open_scan(tmp_path, names=r"z(-?\d+)")
+    assert z_um.tolist() == [-30, -20, -10]
+    assert_holds(images, FILM[:3])
+
+
+@pytest.mark.parametrize(
+    ("files", "arguments", "message"),
+    [
+        (["a"], {}, "^path: got file names that differ in 0 numbers, as 'a'; give names="),
+        (["1_2", "2_3"], {}, "^path: got file names that differ in 2 numbers"),
+        (["1", "2_3"], {}, "^path: got file names with more and with fewer numbers"),
+        (["z-1", "z-2"], {}, "^path: got file names as 'z-1', where - may be a hyphen or a minus"),
+        (["z1", "z01", "z2"], {}, "^path: got file names in which depths repeat"),
+        (["z1", "z2"], {"names": "("}, "^names: got '[(]', which is no regular expression"),
+        (["z1", "z2"], {"names": "y(.)"}, "^names: got .*, which finds no group, or several, in 'z1'"),
+        (["z1", "z2"], {"names": r"z\d"}, "^names: got .*, which finds no group"),
+        (["z1", "zx"], {"names": "z(.)"}, "^names: got .*, which finds what is no number"),
+        (["z1", "z2"], {"start_um": 1}, "^start_um, step_um, csv, names: got too many or too few"),
+        (["z1", "z2"], {"start_um": 1, "step_um": 2, "names": "(1)"}, "^start_um, step_um, csv, names"),
+        (["z1", "z2"], {"start_um": np.nan, "step_um": 2}, "^start_um: got nan"),
+        (["z1", "z2"], {"csv": "short.csv"}, r"^csv: got 1 rows with columns \['z_um'\], allowed is .* each of 2"),
+        (["z1", "z2"], {"csv": "other.csv"}, r"^csv: got 2 rows with columns \['z'\]"),
+        (["z1", "z2"], {"csv": "empty.csv"}, "^csv: got .*, which cannot be read"),
+        (["z1", "z2"], {"csv": "nan.csv"}, "^csv: got NaN or infinity"),
+    ],
+)
+def test_depths_that_are_refused(tmp_path, monkeypatch, files, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    for name in files:
+        write(tmp_path / f"{name}.tif", FILM[0])
+    for name, text in {"short": "z_um\n1\n", "other": "z\n1\n2\n", "empty": "", "nan": "z_um\nnan\n2\n"}.items():
+        (tmp_path / f"{name}.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        open_scan(tmp_path, **arguments)
+
+
+# -------------------- measured
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_batch_reads_files_where_they_are_measured(few, calibration, tmp_path, n_jobs):
+    frames = np.stack([np.roll(few[0], k, axis=1) for k in range(5)])
+    for k, frame in enumerate(frames):
+        write(tmp_path / f"{k}.tif", frame)
+    measured = batch(open_images(tmp_path), calibration, n_jobs=n_jobs, progress=False)
+    pd.testing.assert_frame_equal(measured, batch(frames, calibration, progress=False), check_exact=True)
