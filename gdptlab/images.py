@@ -310,7 +310,8 @@ def _found(tif: tifffile.TiffFile, path: Path) -> tuple[list[tuple[Path, int]], 
     if any(len(one.axes.replace("Y", "").replace("X", "").replace("S", "")) > 1 for one in series):
         kind = f"images along the axes {series[0].axes} of lengths {series[0].shape}"
         raise _refused(path, kind, "is one axis, time or depth, beside rows and columns: save a film for each channel")
-    if len(series) == 1 and raw is not None and not series[0].is_multifile:
+    plain = len(series) == 1 and raw is not None and not series[0].is_multifile and "S" not in series[0].axes
+    if plain:
         n, size = int(np.prod(series[0].shape[:-2])), series[0].keyframe.nbytes
         if raw + n * size > tif.filehandle.size:
             raise _refused(path, f"{n} images in a file that is cut off", "are whole files")
