@@ -520,13 +520,17 @@ def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) 
     """Centre (x, y) of the particle in every slice, (N, 2), px."""
     cut = _cut(scan, x_px, y_px, size // 2)
     cut = cut - np.median(cut, axis=(1, 2), keepdims=True)
+    weight = np.einsum("kij,kij->k", cut, cut)
+    if not weight.all():
+        blank = np.flatnonzero(weight == 0).tolist()
+        raise ValueError(f"scan: got frames without contrast around x_px, y_px at {blank}, allowed are frames with it")
     shifts = [
         # Half a turn about the middle moves an image that is symmetric about c by -2 c.
         phase_cross_correlation(image, image[::-1, ::-1], upsample_factor=100, normalization=None)[0] / 2
         for image in cut
     ]
     order = np.argsort(z_um)
-    weight = np.einsum("kij,kij->k", cut, cut)[order]
+    weight = weight[order]
     offsets = np.empty((len(scan), 2))
     for axis, values in enumerate(np.asarray(shifts).T):
         if len(scan) >= 5:
