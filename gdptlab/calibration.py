@@ -7,7 +7,7 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 import os
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Integral
 from pathlib import Path
@@ -114,8 +114,24 @@ class Calibration:
         n_sub = whole("n_sub", n_sub, 2, n)
         order = np.argsort(z_um)[np.rint(np.linspace(0, len(stack) - 1, n)).astype(int)]
         stack, z_um = stack[order], z_um[order]
-        subset = ((np.arange(n_sub) + 0.5) * (n - 1) / n_sub + 0.5).astype(np.int64)  # to the nearest
-        return cls(stack, z_um, subset, normalised(levelled(denoised(stack) if denoise else stack)))
+        templates = normalised(levelled(denoised(stack) if denoise else stack))
+        return cls(stack, z_um, _middles(n, n_sub), templates)
+
+    def with_subset(self, n_sub: int) -> Self:
+        """Return the same calibration with another number of images that frames are correlated with.
+
+        Parameters
+        ----------
+        n_sub : int
+            As in `from_stack`, 2 to N.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If it is no such number.
+        """
+        subset = _middles(len(self), whole("n_sub", n_sub, 2, len(self)))
+        return replace(self, subset=subset, _plans={})
 
     @classmethod
     @on_one_core
@@ -394,6 +410,11 @@ class Calibration:
         if not len(data["stack"]) == len(data["z_um"]) == len(data["templates"]) > data["subset"].max():
             raise ValueError(f"path: got {name!r}, whose parts do not fit each other")
         return cls(**data)
+
+
+def _middles(n: int, n_sub: int) -> NDArray[np.int64]:
+    """Indices of the images in the middle of n_sub equal bins of n."""
+    return ((np.arange(n_sub) + 0.5) * (n - 1) / n_sub + 0.5).astype(np.int64)  # to the nearest
 
 
 def _depths(z_um: ArrayLike) -> NDArray[np.float64]:
