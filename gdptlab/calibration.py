@@ -186,13 +186,7 @@ class Calibration:
             raise TypeError(f"size: got {size!r}, allowed are odd whole numbers")
         if not 3 <= size <= largest or size % 2 == 0:
             raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {largest} for {where}")
-        centres = _centres(scan, z_um, x_px, y_px, size)
-        margin = min(room + 2 - size // 2, 16)  # for the spline, and for a particle that drifts
-        stack = [
-            shift_image(image, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
-            for image, (x, y) in zip(_cut(scan, x_px, y_px, size // 2 + margin), centres, strict=True)
-        ]
-        stack = np.stack(stack)[:, margin:-margin, margin:-margin]
+        stack, _ = _centred(scan, z_um, x_px, y_px, size, room)
         return cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
 
     def __len__(self) -> int:
@@ -516,6 +510,19 @@ def _halved(images: NDArray) -> NDArray[np.float32]:
 def _cut(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
     x, y = round(x_px), round(y_px)
     return scan[:, y - half : y + half + 1, x - half : x + half + 1]
+
+
+def _centred(
+    scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int, room: int
+) -> tuple[NDArray, NDArray[np.float64]]:
+    """Images (N, size, size) with the particle on the middle pixel, and where it was, (x, y) in (N, 2)."""
+    centres = _centres(scan, z_um, x_px, y_px, size)
+    margin = min(room + 2 - size // 2, 16)  # for the spline, and for a particle that drifts
+    stack = [
+        shift_image(image, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
+        for image, (x, y) in zip(_cut(scan, x_px, y_px, size // 2 + margin), centres, strict=True)
+    ]
+    return np.stack(stack)[:, margin:-margin, margin:-margin], centres
 
 
 def _image_size(cut: NDArray, faint: float = 0.08) -> int:
