@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, shift
 from scipy.spatial import KDTree
 
-from gdptlab.calibration import LARGEST, Calibration, _centred, _depths, _image_size, denoised, levelled
+from gdptlab.calibration import LARGEST, Calibration, _centred, _depths, _image_size, denoised, levelled, noise_level
 from gdptlab.check import real_array, whole
-from gdptlab.correlation import normalised
 from gdptlab.cores import on_one_core
+from gdptlab.correlation import normalised
 
 STANDS_OUT = 8.0
 """Height of a bead's spot above what surrounds it, in standard deviations, from which on it is one."""
@@ -57,6 +57,8 @@ class ScanCalibration:
         A row for each choice (the index): `value`, `how` ("by itself" or "given") and `why`.
     overview : float32 array (rows, columns)
         The scan where it is sharpest.
+    noise : float
+        Standard deviation of the noise of a pixel of the scan, counts: what a frame has; the average has less.
     """
 
     calibration: Calibration
@@ -65,6 +67,7 @@ class ScanCalibration:
     clipped: NDArray[np.float64]
     settings: pd.DataFrame
     overview: NDArray[np.float32]
+    noise: float
 
 
 def find_beads(scan: ArrayLike, z_um: ArrayLike) -> pd.DataFrame:
@@ -159,7 +162,8 @@ def calibrate(
         ],
         columns=["setting", "value", "how", "why"],
     ).set_index("setting")
-    return ScanCalibration(calibration, beads, drift, clipped, settings, overview)
+    noise = noise_level(scan[:: max(len(scan) // 5, 1)])
+    return ScanCalibration(calibration, beads, drift, clipped, settings, overview, noise)
 
 
 def _checked(scan: ArrayLike, z_um: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
@@ -272,8 +276,8 @@ def _averaged(
     looked = beads.index[alone] if given else beads.index[alone][:MOST_BEADS]
     if not len(looked):
         raise ValueError(
-            f"scan: got {len(beads)} beads, none with {size} px to the next and {size // 2 + 2} to the border, needed is "
-            "one; give a smaller size, or the place of one in beads_px, or scan a sparser slide"
+            f"scan: got {len(beads)} beads, none with {size} px to the next and {size // 2 + 2} to the border, needed "
+            "is one; give a smaller size, or the place of one in beads_px, or scan a sparser slide"
         )
     clipped = _clipped(scan, beads.loc[looked], size)
     beads.loc[looked, "clipped"] = clipped.sum(axis=1)

@@ -1,10 +1,10 @@
 """Settings of `locate` from the frames themselves, each of which can be given instead.
 
-The threshold of C_m: how often does what is certainly no particle reach it? In a frame with its sign turned every bright
-particle is dark, so whatever is found there is false: noise, gaps between particles, rings about them. It is as
-noisy and as crowded as the frame itself, so about as many of its finds lie above any C_m as of the frame's own that are
-false for the same reasons. The threshold is the lowest at which they are few. (What it cannot see are particles that
-are there and come out at a wrong depth.)
+The threshold of C_m: how often does what is certainly no particle reach it? In a frame with its sign turned every
+bright particle is dark, so whatever is found there is false: noise, gaps between particles, rings about them. It is
+as noisy and as crowded as the frame itself, so about as many of its finds lie above any C_m as of the frame's own
+that are false for the same reasons. The threshold is the lowest at which they are few. (What it cannot see are
+particles that are there and come out at a wrong depth.)
 """
 
 from collections.abc import Iterable
