@@ -206,3 +206,27 @@ def symptoms(cases: Mapping[str, tuple[NDArray, pd.DataFrame, pd.DataFrame]], co
     around = {"facecolor": "0.4", "frameon": True, "labelcolor": "white"}
     figure.legend(handles, labels, loc="outside lower center", ncols=3, **around)
     return figure
+
+
+@_styled
+def depth_against_truth(cases: Mapping[str, pd.DataFrame], limits_um: tuple[float, float] = (-50, 50)) -> Figure:
+    """Plot measured against true depth, a panel for each case.
+
+    Parameters
+    ----------
+    cases : dict of DataFrame
+        Pairs as from `match`, by the name of the case.
+    limits_um : (float, float)
+        Of z.
+
+    Returns
+    -------
+    Figure
+    """
+    figure, [axes] = _panels(len(cases), 10, 2.9, sharey=True)
+    for panel, (name, pairs) in zip(axes, cases.items(), strict=True):
+        panel.plot(limits_um, limits_um, color="0.6", lw=1)
+        panel.plot(pairs["z_um"], pairs["z_um"] + pairs["dz_um"], "o", color=COLOURS[0], ms=3.5, alpha=0.8, mew=0)
+        panel.set(title=name, xlabel="true z (µm)", aspect="equal")
+    axes[0].set_ylabel("measured z (µm)")
+    return figure
