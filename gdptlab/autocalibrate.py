@@ -14,10 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, shift
 from scipy.spatial import KDTree
 
+from gdptlab.assess import match
 from gdptlab.calibration import LARGEST, Calibration, _centred, _depths, _image_size, denoised, levelled, noise_level
 from gdptlab.check import real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.correlation import normalised
+from gdptlab.locate import locate
 
 STANDS_OUT = 8.0
 """Height of a bead's spot above what surrounds it, in standard deviations, from which on it is one."""
@@ -33,6 +35,13 @@ ALIKE = 0.9
 
 COVERED = 0.9
 """Correlation that an image at any depth has, at least, with one of the subset, if the subset is chosen here."""
+
+
+SHARES = (1.0, 0.9, 0.8, 0.7)
+"""Of the widest image, tried as the size of a template."""
+
+CHECKED = 7
+"""Slices of the scan in which beads are looked for, to choose that size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +124,8 @@ def calibrate(
     beads_px : array (n, 2), optional
         x and y of the beads to use, px, all of them; found if not given.
     size : int, optional
-        Rows and columns of a template, odd; just holds the widest image of the beads if not given.
+        Rows and columns of a template, odd. If not given, just enough for the widest image of the beads, or less if
+        in the scan itself, whose depths are known, more beads are then found. With `beads_px`, the former.
     n_sub : int, optional
         Images that frames are correlated with; as many as every depth needs to be like one of them if not given.
 
@@ -144,6 +154,8 @@ def calibrate(
         beads = _table(overview, beads_px.astype(float))
     chosen = size or _size(scan, beads)
     beads, stack, drift, clipped = _averaged(scan, z_um, beads, chosen, given=beads_px is not None)
+    if size is None and beads_px is None:
+        stack = _fitting(stack, scan, z_um, beads)
     calibration = Calibration.from_stack(stack, z_um, n_sub=n_sub or min(9, len(scan)))
     if n_sub is None:
         calibration = calibration.with_subset(_subset_size(calibration))
@@ -152,7 +164,7 @@ def calibrate(
     settings = pd.DataFrame(
         [
             ("beads", f"{used} of {len(beads)}", how[beads_px is not None], "alone, not clipped and alike; averaged"),
-            ("size", f"{chosen} px", how[size is not None], "just holds the widest image of a bead"),
+            ("size", f"{calibration.size} px", how[size is not None], _reason(chosen, calibration.size)),
             (
                 "n_sub",
                 f"{len(calibration.subset)} of {len(calibration)}",
@@ -261,6 +273,32 @@ def _size(scan: NDArray, beads: pd.DataFrame) -> int:
         raise ValueError("scan: got no bead with room around it, needed is one, wholly in the frame")
     sizes = [_image_size(_window(scan, *bright.loc[i, ["x_px", "y_px"]], half=h)[0]) for i, h in half.items()]
     return max(int(np.median(sizes)) // 2 * 2 + 1, 5)
+
+
+def _fitting(stack: NDArray, scan: NDArray, z_um: NDArray, beads: pd.DataFrame) -> NDArray[np.float32]:
+    """The stack, cut smaller if more of the scan's beads are then found at their depth.
+
+    A smaller template leaves out what is faint, but also the neighbours.
+    """
+    n, within_um = stack.shape[1], (z_um[-1] - z_um[0]) / 20
+    looked = np.rint(np.linspace(0, len(scan) - 1, CHECKED + 2)[1:-1]).astype(int)
+    true = pd.concat([beads[["x_px", "y_px"]].assign(frame=k, z_um=z_um[k]) for k in looked], ignore_index=True)
+    best, most = stack, 0.0
+    for share in SHARES:
+        m = round(n * (1 - share) / 2)
+        cut = stack[:, m : n - m, m : n - m]
+        calibration = Calibration.from_stack(cut, z_um, n_sub=min(9, len(scan)))
+        found = pd.concat([locate(scan[k], calibration).assign(frame=k) for k in looked], ignore_index=True)
+        right = len(match(found, true, within_px=max(2, n / 10), within_um=within_um))
+        if right > 1.05 * most:  # not for one bead more or less
+            best, most = cut, right
+    return best
+
+
+def _reason(widest: int, size: int) -> str:
+    if size == widest:
+        return "just holds the widest image of a bead"
+    return f"the widest image has {widest} px, but so more of the scan's beads are found at their depth"
 
 
 def _averaged(
