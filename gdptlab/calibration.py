@@ -7,7 +7,7 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 import os
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Integral
 from pathlib import Path
@@ -114,8 +114,24 @@ class Calibration:
         n_sub = whole("n_sub", n_sub, 2, n)
         order = np.argsort(z_um)[np.rint(np.linspace(0, len(stack) - 1, n)).astype(int)]
         stack, z_um = stack[order], z_um[order]
-        subset = ((np.arange(n_sub) + 0.5) * (n - 1) / n_sub + 0.5).astype(np.int64)  # to the nearest
-        return cls(stack, z_um, subset, normalised(levelled(denoised(stack) if flag("denoise", denoise) else stack)))
+        templates = normalised(levelled(denoised(stack) if flag("denoise", denoise) else stack))
+        return cls(stack, z_um, _middles(n, n_sub), templates)
+
+    def with_subset(self, n_sub: int) -> Self:
+        """Return the same calibration with another number of images that frames are correlated with.
+
+        Parameters
+        ----------
+        n_sub : int
+            As in `from_stack`, 2 to N.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If it is no such number.
+        """
+        subset = _middles(len(self), whole("n_sub", n_sub, 2, len(self)))
+        return replace(self, subset=subset, _plans={})
 
     @classmethod
     @on_one_core
@@ -170,13 +186,7 @@ class Calibration:
             raise TypeError(f"size: got {size!r}, allowed are odd whole numbers")
         if not 3 <= size <= largest or size % 2 == 0:
             raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {largest} for {where}")
-        centres = _centres(scan, z_um, x_px, y_px, size)
-        margin = min(room + 2 - size // 2, 16)  # for the spline, and for a particle that drifts
-        stack = [
-            shift_image(image, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
-            for image, (x, y) in zip(_cut(scan, x_px, y_px, size // 2 + margin), centres, strict=True)
-        ]
-        stack = np.stack(stack)[:, margin:-margin, margin:-margin]
+        stack, _ = _centred(scan, z_um, x_px, y_px, size, room)
         return cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
 
     def __len__(self) -> int:
@@ -396,6 +406,11 @@ class Calibration:
         return cls(**data)
 
 
+def _middles(n: int, n_sub: int) -> NDArray[np.int64]:
+    """Indices of the images in the middle of n_sub equal bins of n."""
+    return ((np.arange(n_sub) + 0.5) * (n - 1) / n_sub + 0.5).astype(np.int64)  # to the nearest
+
+
 def _depths(z_um: ArrayLike) -> NDArray[np.float64]:
     """Check depths, which need more digits than images have."""
     real_array("z_um", z_um, 1)
@@ -495,6 +510,19 @@ def _halved(images: NDArray) -> NDArray[np.float32]:
 def _cut(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
     x, y = round(x_px), round(y_px)
     return scan[:, y - half : y + half + 1, x - half : x + half + 1]
+
+
+def _centred(
+    scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int, room: int
+) -> tuple[NDArray, NDArray[np.float64]]:
+    """Images (N, size, size) with the particle on the middle pixel, and where it was, (x, y) in (N, 2)."""
+    centres = _centres(scan, z_um, x_px, y_px, size)
+    margin = min(room + 2 - size // 2, 16)  # for the spline, and for a particle that drifts
+    stack = [
+        shift_image(image, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
+        for image, (x, y) in zip(_cut(scan, x_px, y_px, size // 2 + margin), centres, strict=True)
+    ]
+    return np.stack(stack)[:, margin:-margin, margin:-margin], centres
 
 
 def _image_size(cut: NDArray, faint: float = 0.08) -> int:

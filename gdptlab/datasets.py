@@ -92,6 +92,29 @@ def sample(image_type: str = "fluorescent") -> Sample:
     )
 
 
+def sample_scan(image_type: str = "fluorescent") -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
+    """Make a scan of beads on a slide, with the microscope and the noise of the samples.
+
+    Parameters
+    ----------
+    image_type : {"fluorescent", "brightfield", "disturbed"}
+
+    Returns
+    -------
+    scan : uint16 array (51, 512, 512)
+        Frames of 14 beads, all at the same depth, most of them far enough apart.
+    z_um : float64 array (51,)
+        The depths, -50 to 50 µm.
+    """
+    choice("image_type", image_type, IMAGE_TYPES)
+    microscope, z_um, rng = Microscope(), np.linspace(-50, 50, 51), np.random.default_rng(20250408)
+    places = np.stack(np.meshgrid(*2 * [np.arange(56, 512, 100)]), axis=-1).reshape(-1, 2)
+    x_px, y_px = (rng.permutation(places)[:14] + rng.uniform(-12, 12, (14, 2))).T
+    beads = pd.DataFrame({"x_px": x_px, "y_px": y_px})
+    scan = [microscope.render(beads.assign(z_um=z), image_type=image_type, rng=rng) for z in z_um]
+    return np.stack(scan), z_um
+
+
 def planar_beads() -> PlanarBeads:
     """Load real images of beads at known heights, if they are on this machine.
 

@@ -43,6 +43,16 @@ def test_subset_is_the_middle_of_equal_bins(clean_stack, n, n_sub, expected):
     assert (subset + 1).tolist() == list(expected)
 
 
+def test_another_subset_is_that_of_a_new_calibration(stacks, calibration):
+    other = calibration.with_subset(5)
+    made = Calibration.from_stack(stacks["fluorescent"], Z_UM, n_sub=5)
+    np.testing.assert_array_equal(other.subset, made.subset)
+    np.testing.assert_array_equal(other.expected, made.expected)
+    assert len(calibration.subset) == 9
+    with pytest.raises(ValueError, match="n_sub: got 52, allowed are whole numbers from 2 to 51"):
+        calibration.with_subset(52)
+
+
 def test_attributes(stacks):
     made = Calibration.from_stack(stacks["disturbed"], Z_UM)
     assert len(made) == 51 and made.size == 61

@@ -1,0 +1,70 @@
+"""Settings from the frames themselves, and what can be overruled."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from gdptlab import assess, batch, locate
+from gdptlab.settings import choose_settings
+
+
+@pytest.mark.parametrize("kind", ["fluorescent", "brightfield", "disturbed"])
+def test_threshold_keeps_particles_and_leaves_noise_out(isolated, calibrations, kind) -> None:
+    frames, truth = isolated[kind]
+    settings = choose_settings(frames, calibrations[kind], method="correlation", looked_at=2)
+    assert settings.threshold < 0.6 and not settings.inverted
+    score = assess.scores(locate(frames[3], calibrations[kind], **settings.arguments), of(truth, 3))
+    assert score.recall > 0.95 and score.precision > 0.95
+    assert ((settings.false["cm"] >= settings.threshold).sum()) <= 0.01 * len(settings.found)
+
+
+def of(truth, frame):
+    return truth[truth["frame"] == frame].drop(columns="frame").reset_index(drop=True)
+
+
+def test_joint_is_chosen_for_particles_that_are_alike(few, calibration, microscope) -> None:
+    frame, particles = few
+    rng = np.random.default_rng(8)
+    more = pd.concat([particles, particles.assign(x_px=particles["x_px"] - 16, z_um=-particles["z_um"])])
+    crowd = [microscope.render(more.assign(brightness=b), frame.shape, rng=rng) for b in (1.0, np.arange(1, 9) / 4)]
+    methods = [choose_settings([image], calibration).arguments["method"] for image in crowd]
+    assert methods == ["joint", "correlation"]
+    assert choose_settings([frame], calibration).arguments["method"] == "correlation"  # too few to tell
+
+
+def test_what_is_given_is_used_and_said(few, calibration) -> None:
+    settings = choose_settings([few[0]], calibration, threshold=0.7, refine=False)
+    assert settings.arguments == {"method": "correlation", "threshold": 0.7, "refine": False, "min_distance_px": 15.25}
+    how = {"method": "by itself", "threshold": "given", "refine": "given", "min_distance_px": "by itself"}
+    assert settings.table["how"].to_dict() == how
+    assert len(batch([few[0]], calibration, progress=False, **settings.arguments)) == 4
+
+
+def test_opposite_contrast_is_noticed(few, calibration) -> None:
+    turned = choose_settings([60_000 - few[0].astype(float)], calibration, method="correlation")
+    assert turned.inverted
+    assert not choose_settings([few[0]], calibration, method="correlation").inverted
+
+
+def test_blank_frames_have_no_particles(calibration) -> None:
+    settings = choose_settings(np.zeros((2, 80, 80)), calibration, method="correlation")
+    assert settings.threshold == 0.5 and settings.found.empty
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"frames": []}, ValueError, "frames: got none"),
+        ({"threshold": 1.5}, ValueError, "threshold: got 1.5, allowed is above 0 and at most 1"),
+        ({"threshold": "low"}, TypeError, "threshold: got 'low'"),
+        ({"method": "guess"}, ValueError, "method: got 'guess', allowed are"),
+        ({"method": "joint", "threshold": 0.5}, ValueError, "threshold: got one with method 'joint'"),
+        ({"false_share": 1}, ValueError, "false_share: got 1, allowed is above 0 and below 1"),
+        ({"looked_at": 0}, ValueError, "looked_at: got 0"),
+        ({"min_distance_px": -1}, ValueError, "min_distance_px: got -1"),
+        ({"frames": [np.full((80, 80), np.nan)]}, ValueError, "image: got NaN"),
+    ],
+)
+def test_refuses(calibration, changes, error, message) -> None:
+    with pytest.raises(error, match=message):
+        choose_settings(**{"frames": np.zeros((1, 80, 80)), "calibration": calibration} | changes)
