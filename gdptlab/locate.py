@@ -4,8 +4,8 @@ By correlation (the paper's section 2):
 
 1. The frame is correlated with the N_sub images of the calibration's subset (Figure 2b).
 2. Candidates are local peaks, in any of the maps, above a threshold.
-3. A candidate's profile is the C_m of each map at the peak (Figure 2c), each at the top of parabolas through the
-   neighbouring pixels: peaks lie between pixels, and those of different maps up to a pixel apart.
+3. A candidate's profile is the highest C_m in each map within two pixels of the peak (Figure 2c), at the top of
+   parabolas through the neighbouring pixels: peaks lie between pixels, and those of different maps a pixel apart.
 4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, which is blind
    to the noise that lowers the whole profile; a parabola through the best three gives the part of a step.
 5. Refinement: the candidate's window is correlated with stack images from the guess onward, uphill along z
@@ -201,16 +201,27 @@ def _candidates(
     image: NDArray[np.float32], calibration: Calibration, threshold: float
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Peaks of the correlation maps: place (y, x) (n, 2), z in steps of the stack, C_m."""
-    scale = 2 if calibration.half_resolution else 1
+    scale, near = (2, 1) if calibration.half_resolution else (1, 2)
     searched = cv2.pyrDown(image) if scale == 2 else image
     maps = calibration.correlator(searched.shape)(searched)
     highest = maps.max(axis=0)
     peak = (highest >= BETWEEN * threshold) & (highest == cv2.dilate(highest, np.ones((5, 5), np.uint8)))
     # A peak on the rim of a map is the flank of one outside: its place is unknown.
-    peak[[0, -1]] = peak[:, [0, -1]] = False
+    peak[:near], peak[-near:], peak[:, :near], peak[:, -near:] = False, False, False, False
     row, column = np.divmod(np.flatnonzero(peak), peak.shape[1])
-    here = maps[:, row, column]
-    sides = [(maps[:, row - i, column - j], maps[:, row + i, column + j]) for i, j in ((1, 0), (0, 1))]
+    around = np.arange(-near, near + 1)
+    patches = maps[:, row[:, None, None] + around[:, None], column[:, None, None] + around]
+    down, right = np.divmod(patches.reshape(len(maps), len(row), (2 * near + 1) ** 2).argmax(axis=2), 2 * near + 1)
+    each, last = np.arange(len(maps))[:, None], np.array(highest.shape)[:, None, None] - 1
+    top = np.array([row + down - near, column + right - near])
+
+    def values(i: int, j: int) -> NDArray[np.float32]:
+        """C_m in each map beside its own peak, at the rim that of the rim."""
+        y, x = np.clip(top + np.array((i, j))[:, None, None], 0, last)
+        return maps[each, y, x]
+
+    here = values(0, 0)
+    sides = [(values(-i, -j), values(i, j)) for i, j in ((1, 0), (0, 1))]
     profile = (here + sum(_rise(before, here, after) for before, after in sides)).T
 
     likeness = _standardised(profile) @ _standardised(calibration.expected).T
@@ -219,9 +230,9 @@ def _candidates(
 
     best, each = profile.argmax(axis=1), np.arange(len(row))
     part = [_vertex(np.stack([before, here, after], axis=-1)[best, each]) for before, after in sides]
+    place = top[:, best, each].T + np.stack(part, axis=1)
     middle = calibration.search_templates.shape[-1] // 2
-    place = scale * (np.stack([row, column], axis=1) + np.stack(part, axis=1) + middle)
-    return place, step, profile[each, best]
+    return scale * (place + middle), step, profile[each, best]
 
 
 def _pixels(image: NDArray[np.float32], calibration: Calibration, place: NDArray) -> NDArray[np.int64]:
