@@ -37,6 +37,9 @@ COVERED = 0.9
 """Correlation that an image at any depth has, at least, with one of the subset, if the subset is chosen here."""
 
 
+LEAST = 7
+"""Frames of a scan."""
+
 SHARES = (1.0, 0.9, 0.8, 0.7)
 """Of the widest image, tried as the size of a template."""
 
@@ -182,8 +185,10 @@ def _checked(scan: ArrayLike, z_um: ArrayLike) -> tuple[NDArray, NDArray[np.floa
     """Scan, as it is recorded, and depths, both in the order of increasing depth."""
     scan, z_um = np.asarray(scan), _depths(z_um)
     real_array("scan", scan[:1], 3)
-    if len(scan) < 5 or len(z_um) != len(scan):
-        raise ValueError(f"scan, z_um: got {len(scan)} frames and {len(z_um)} depths, needed are as many, 5 or more")
+    if len(scan) < LEAST or len(z_um) != len(scan):
+        raise ValueError(
+            f"scan, z_um: got {len(scan)} frames and {len(z_um)} depths, needed are as many, {LEAST} or more"
+        )
     order = np.argsort(z_um)
     return scan[order], z_um[order]
 
@@ -368,7 +373,8 @@ def _lag(images: NDArray, model: NDArray) -> float:
     """Slices by which images (N, n, n) must be moved to be most like those of the model, both normalised."""
     most = max(len(images) // 10, 1)
     likeness = np.einsum("kij,lij->kl", images, model)
-    mean = np.array([np.diagonal(likeness, lag).mean() for lag in range(-most - 1, most + 2)])
+    inner = np.arange(most + 1, len(images) - most - 1)  # the same for all lags: the ends may be the noisiest
+    mean = np.array([likeness[inner, inner + lag].mean() for lag in range(-most - 1, most + 2)])
     best = 1 + int(mean[1:-1].argmax())
     before, here, after = mean[best - 1 : best + 2]
     bend = before + after - 2 * here

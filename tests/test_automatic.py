@@ -34,14 +34,16 @@ def by_itself(frames, truth, calibration, inside, **within):
 
 
 @pytest.mark.parametrize("kind", ["fluorescent", "brightfield", "disturbed"])
-def test_synthetic_frames(kind, stacks) -> None:
-    """3 frames of 50 particles; scan of 14 beads; both with fixed seeds of their own."""
+def test_synthetic_frames(kind) -> None:
+    """3 frames of 50 particles and a scan of 14 beads, with fixed seeds of their own; by hand a bead in two sizes."""
     sample, inside = datasets.sample(kind), "30 <= x_px <= 481 and 30 <= y_px <= 481"
     truth = sample.truth.query(inside)
     scan, z_um = datasets.sample_scan(kind)
-    one = [Calibration.from_stack(stacks[kind][:, m : 61 - m, m : 61 - m], z_um) for m in (0, 5, 10)]
-    hand = best_by_hand(sample.frames, truth, one, inside, joint=one[:1])
-    itself = by_itself(sample.frames, truth, calibrate(scan, z_um).calibration, inside)
+    made = calibrate(scan, z_um)
+    x_px, y_px = made.beads.loc[made.beads["verdict"] == "used", ["x_px", "y_px"]].iloc[0]
+    one = [Calibration.from_scan(scan, z_um, x_px, y_px, size=size) for size in (51, 61)]
+    hand = best_by_hand(sample.frames, truth, one, inside, joint=one[1:])
+    itself = by_itself(sample.frames, truth, made.calibration, inside)
     assert itself["recall"] >= 0.9 * hand["recall"]
     assert itself["sigma_z_um"] <= 1.1 * hand["sigma_z_um"]
 
