@@ -7,10 +7,13 @@ and a tenth more error in z, at most.
 
 import numpy as np
 import pytest
+from conftest import THOROUGH
 
 from gdptlab import Calibration, assess, batch, datasets
 from gdptlab.autocalibrate import calibrate
 from gdptlab.settings import choose_settings
+
+pytestmark = pytest.mark.skipif(not THOROUGH, reason="takes minutes: GDPTLAB_THOROUGH=1 pytest tests/test_automatic.py")
 
 THRESHOLDS = np.arange(0.2, 0.96, 0.05)
 

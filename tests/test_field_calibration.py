@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import THOROUGH
 
 from gdptlab import datasets, match
 from gdptlab.assess import scores
@@ -273,6 +274,7 @@ def test_from_one_refuses():
 # -------------------- real beads
 
 
+@pytest.mark.skipif(not THOROUGH, reason="takes a minute, and notebook 09 has it: GDPTLAB_THOROUGH=1 does it here")
 def test_real_beads():
     """Two of the frames; all of them are in notebook 09."""
     try:

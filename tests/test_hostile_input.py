@@ -23,7 +23,7 @@ from gdptlab.stream import batch_to_parquet
 from gdptlab.tables import in_um, save_points, save_table
 
 tried = settings(
-    max_examples=2000 if THOROUGH else 60,
+    max_examples=2000 if THOROUGH else 25,
     deadline=None,
     derandomize=not THOROUGH,
     database=None,

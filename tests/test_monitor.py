@@ -319,7 +319,9 @@ def test_stop_does_not_wait_for_the_source(tmp_path):
 
 
 def test_an_action_may_stop_the_monitor(tmp_path):
-    with Monitor(Hand(image(0.95)), ten, [trigger(action=lambda r: monitor.stop())], log=tmp_path / "log") as monitor:
+    camera = Hand()
+    with Monitor(camera, ten, [trigger(action=lambda r: monitor.stop())], log=tmp_path / "log") as monitor:
+        camera.queue.put(image(0.95))  # not before the name of the monitor is known to the action
         assert monitor.wait(60)
         assert monitor.status().state == "stopped"
     assert read_log(tmp_path / "log")[0]["on_w"].tolist() == [True]
