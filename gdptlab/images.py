@@ -223,7 +223,9 @@ def open_scan(
     if len(given) > 1 or (start_um is None) != (step_um is None):
         raise ValueError("start_um, step_um, csv, names: got too many or too few, allowed are the first two or one")
     if start_um is not None:
-        z_um = number("start_um", start_um) + number("step_um", step_um) * np.arange(len(images))
+        with np.errstate(over="ignore", invalid="ignore"):
+            z_um = number("start_um", start_um) + number("step_um", step_um) * np.arange(len(images))
+        real_array("start_um, step_um", z_um, 1)
     elif csv is not None:
         z_um = _depths_of_table(csv, len(images))
     else:
@@ -236,8 +238,8 @@ def _depths_of_table(path: str | os.PathLike[str], n: int) -> NDArray[np.float64
     """Column z_um of a CSV file, if it has a number for each of `n` images."""
     try:
         table = pd.read_csv(path)
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"csv: got {str(path)!r}, where there is no file") from error
     except Exception as error:  # of many kinds
         raise ValueError(f"csv: got {path!r}, which cannot be read: {error}") from error
     if "z_um" not in table or len(table) != n:

@@ -27,7 +27,7 @@ tried = settings(
     deadline=None,
     derandomize=not THOROUGH,
     database=None,
-    phases=[Phase.generate] if not THOROUGH else [Phase.generate, Phase.shrink],
+    phases=[Phase.generate],
     suppress_health_check=list(HealthCheck),
 )
 
