@@ -159,8 +159,8 @@ def open_images(path: str | os.PathLike[str]) -> Images:
         if any(path == known for known, _ in files):  # of a set of OME-TIFFs
             continue
         with _opened(path) as tif:
-            found, raw = _found(tif, path)
             here, um = _frame_of(tif, path), _um_per_px(tif)
+            found, raw = _found(tif, path)
         frame, um_per_px = frame or here, um_per_px or um
         if here != frame:
             raise _refused(path, f"another size or type than {paths[0].name!r}", "are images of one size and type")
