@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from gdptlab.check import number, positive, real_array
+from gdptlab.check import LARGEST, number, positive, real_array
 from gdptlab.check import table as check_table
 
 RESAMPLES = 1000
@@ -27,7 +27,8 @@ def match(
     Parameters
     ----------
     measured, true : DataFrame
-        Columns `x_px`, `y_px`, `z_um`; with `frame` in both, or in neither (one frame). Rows with NaN have no pair.
+        Columns `x_px`, `y_px`, `z_um`; with `frame` in both, or in neither (one frame). Rows with NaN or
+        numbers beyond 1e12 have no pair.
     within_px : float
         Largest difference in x, and in y, of a pair.
     within_um : float
@@ -65,10 +66,10 @@ def match(
 
 
 def _match_frame(measured: pd.DataFrame, true: pd.DataFrame, within_px: float, within_um: float) -> pd.DataFrame:
-    measured, true = (t.loc[np.isfinite(t[list(AXES.values())]).all(axis=1)] for t in (measured, true))
+    measured, true = (t.loc[(t[list(AXES.values())].abs() <= LARGEST).all(axis=1)] for t in (measured, true))
     here, there = (t[list(AXES.values())].to_numpy(dtype=float) for t in (measured, true))
     # In units of what is allowed, a pair is allowed if no difference is above 1.
-    scale = np.array([within_px, within_px, within_um])
+    scale = np.maximum([within_px, within_px, within_um], 1 / LARGEST)
     near = KDTree(here / scale).query_ball_tree(KDTree(there / scale), 1, p=np.inf) if len(here) and len(there) else []
     i = np.repeat(np.arange(len(near)), [len(n) for n in near]).astype(int)
     j = np.array([k for n in near for k in n], dtype=int)

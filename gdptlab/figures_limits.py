@@ -19,6 +19,11 @@ AXES = {
 """Panel, with the columns of `Calibration.expected_error` and of `assess.scores` in it."""
 
 
+def _points(i: int, label: str) -> dict[str, object]:
+    """How the points of the i-th curve look."""
+    return {"color": COLOURS[i], "marker": MARKERS[i], "mfc": "none", "capsize": 2, "lw": 1, "label": label}
+
+
 @_styled
 def expected_errors(expected: Mapping[str, pd.DataFrame]) -> Figure:
     """Plot the least error of x, y and z against depth.
@@ -65,17 +70,7 @@ def errors_against_bound(expected: pd.DataFrame, measured: Mapping[str, pd.DataF
         for i, (label, table) in enumerate(measured.items()):
             ends = table[column] - table[f"{column}_low"], table[f"{column}_high"] - table[column]
             shift = (i - (len(measured) - 1) / 2) * 1.2  # µm, so that bars do not hide each other
-            panel.errorbar(
-                table.index + shift,
-                table[column],
-                yerr=np.maximum(ends, 0),
-                color=COLOURS[i],
-                marker=MARKERS[i],
-                mfc="none",
-                capsize=2,
-                lw=1,
-                label=label,
-            )
+            panel.errorbar(table.index + shift, table[column], np.maximum(ends, 0), **_points(i, label))
         panel.set(xlabel="z (µm)", ylabel=f"RMS error of {name}", yscale="log", ylim=(lowest, None))
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
@@ -103,17 +98,7 @@ def biases(tables: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
         panel.axhspan(-third, third, color="0.9", label="a third of σ")
         panel.axhline(0, color="black", lw=0.8)
         for i, (label, table) in enumerate(methods.items()):
-            panel.errorbar(
-                table.index,
-                table["mean"],
-                yerr=table["sem"],
-                color=COLOURS[i],
-                marker=MARKERS[i],
-                mfc="none",
-                capsize=2,
-                lw=1,
-                label=label,
-            )
+            panel.errorbar(table.index, table["mean"], table["sem"], **_points(i, label))
         reach = max(2 * third, *(1.2 * (table["mean"].abs() + table["sem"]).max() for table in methods.values()))
         panel.set(xlabel=xlabel, ylabel=f"mean {ylabel}", ylim=(-reach, reach))
     handles, labels = axes.flat[0].get_legend_handles_labels()

@@ -159,8 +159,8 @@ def open_images(path: str | os.PathLike[str]) -> Images:
         if any(path == known for known, _ in files):  # of a set of OME-TIFFs
             continue
         with _opened(path) as tif:
-            found, raw = _found(tif, path)
             here, um = _frame_of(tif, path), _um_per_px(tif)
+            found, raw = _found(tif, path)
         frame, um_per_px = frame or here, um_per_px or um
         if here != frame:
             raise _refused(path, f"another size or type than {paths[0].name!r}", "are images of one size and type")
@@ -223,7 +223,9 @@ def open_scan(
     if len(given) > 1 or (start_um is None) != (step_um is None):
         raise ValueError("start_um, step_um, csv, names: got too many or too few, allowed are the first two or one")
     if start_um is not None:
-        z_um = number("start_um", start_um) + number("step_um", step_um) * np.arange(len(images))
+        with np.errstate(over="ignore", invalid="ignore"):
+            z_um = number("start_um", start_um) + number("step_um", step_um) * np.arange(len(images))
+        real_array("start_um, step_um", z_um, 1)
     elif csv is not None:
         z_um = _depths_of_table(csv, len(images))
     else:
@@ -236,8 +238,8 @@ def _depths_of_table(path: str | os.PathLike[str], n: int) -> NDArray[np.float64
     """Column z_um of a CSV file, if it has a number for each of `n` images."""
     try:
         table = pd.read_csv(path)
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"csv: got {str(path)!r}, where there is no file") from error
     except Exception as error:  # of many kinds
         raise ValueError(f"csv: got {path!r}, which cannot be read: {error}") from error
     if "z_um" not in table or len(table) != n:
@@ -310,7 +312,7 @@ def _found(tif: tifffile.TiffFile, path: Path) -> tuple[list[tuple[Path, int]], 
     if any(len(one.axes.replace("Y", "").replace("X", "").replace("S", "")) > 1 for one in series):
         kind = f"images along the axes {series[0].axes} of lengths {series[0].shape}"
         raise _refused(path, kind, "is one axis, time or depth, beside rows and columns: save a film for each channel")
-    plain = len(series) == 1 and raw is not None and not series[0].is_multifile and "S" not in series[0].axes
+    plain = len(series) == 1 and raw is not None and not series[0].is_multifile
     if plain:
         n, size = int(np.prod(series[0].shape[:-2])), series[0].keyframe.nbytes
         if raw + n * size > tif.filehandle.size:

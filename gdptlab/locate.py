@@ -430,7 +430,7 @@ def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple
         if first not in done:
             # A list goes along with its task; an array a cluster would put on one worker, and lose with it.
             if not isinstance(block, Images):
-                block = list(block.compute(scheduler="synchronous") if is_dask else block)
+                block = [np.array(one) for one in (block.compute(scheduler="synchronous") if is_dask else block)]
             yield first, block
 
 

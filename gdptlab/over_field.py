@@ -7,6 +7,8 @@ particle is also fitted from the mirror image of its depth, with the others as t
 likelihood is higher. The lower of the two is reported as well.
 """
 
+import threading
+
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
@@ -131,7 +133,7 @@ class _Search:
     def __init__(self, frame: NDArray[np.float32], calibration: FieldCalibration) -> None:
         self.frame, self.calibration, self._images = frame, calibration, calibration.images
         mean = calibration.patterns[0][:, ::FINE, ::FINE]
-        key = MatchedFilter, frame.shape
+        key = MatchedFilter, frame.shape, threading.get_ident()  # it keeps working memory
         if key not in calibration._plans:
             calibration._plans[key] = MatchedFilter(np.ascontiguousarray(mean), frame.shape)
         self._filter = calibration._plans[key]
