@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from gdptlab.particle_images import Columns, compiled
+from gdptlab.cores import compiled
+from gdptlab.particle_images import Columns
 
 BOUNDED = 3.0
 """Residuals beyond so many standard deviations pull no harder than these: light not yet explained is no background."""

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from gdptlab.cores import compiled
+
 FLAT = 1e-4
 """A window whose contrast is below this share of the image's is taken as flat: its correlation is 0."""
 
@@ -70,35 +72,41 @@ class Correlator:
         """
         image = image - np.float32(cv2.mean(image)[0])
         spectrum = cv2.dft(self._pad(image))
-        per_norm = 1 / local_norm(image, self._n)
-        rows, columns = per_norm.shape
+        per_norm = _per_norm(image, self._n)
         for map_, template in zip(self._maps, self._spectra, strict=True):
             cv2.mulSpectrums(spectrum, template, 0, self._product, conjB=True)
             cv2.idft(self._product, self._full, cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
-            np.multiply(self._full[:rows, :columns], per_norm, out=map_)
+            _multiply(self._full, per_norm, map_)
         return self._maps
 
 
-def local_norm(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:
-    """Norm of every n by n window about its own mean; infinite where the window is flat.
+def _per_norm(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+    """One over the norm of every n by n window about its own mean; 0 where the window is flat.
 
-    Parameters
-    ----------
-    image : float32 array (rows, columns)
-        With a mean near zero, so that squares lose no digits.
-    n : int
-
-    Returns
-    -------
-    float32 array (rows - n + 1, columns - n + 1)
+    The image's mean is near zero, so that squares lose no digits.
     """
     inside = slice(n // 2, image.shape[0] - (n - 1) // 2), slice(n // 2, image.shape[1] - (n - 1) // 2)
     mean = cv2.boxFilter(image, cv2.CV_32F, (n, n))[inside]
     square = cv2.sqrBoxFilter(image, cv2.CV_32F, (n, n))[inside]
-    variance = square - mean * mean
-    contrast = cv2.meanStdDev(image)[1][0, 0]
-    variance[variance <= (FLAT * contrast) ** 2] = np.inf
-    return n * np.sqrt(variance)
+    flat = (FLAT * cv2.meanStdDev(image)[1][0, 0]) ** 2
+    per_norm = np.empty(mean.shape, dtype=np.float32)
+    _invert(mean, square, np.float32(flat), n, per_norm)
+    return per_norm
+
+
+@compiled
+def _invert(mean, square, flat, n, per_norm):  # pragma: no cover
+    for r in range(per_norm.shape[0]):
+        for c in range(per_norm.shape[1]):
+            variance = square[r, c] - mean[r, c] * mean[r, c]
+            per_norm[r, c] = np.float32(1) / (np.float32(n) * np.sqrt(variance)) if variance > flat else np.float32(0)
+
+
+@compiled
+def _multiply(image, per_norm, product):  # pragma: no cover
+    for r in range(per_norm.shape[0]):
+        for c in range(per_norm.shape[1]):
+            product[r, c] = image[r, c] * per_norm[r, c]
 
 
 def correlate_plainly(image: NDArray, templates: NDArray) -> NDArray[np.float64]:

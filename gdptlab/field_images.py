@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, median_filter, spline_filter1d
 
-from gdptlab.particle_images import FAINT, RIM, Columns, _spline, compiled
+from gdptlab.cores import compiled
+from gdptlab.particle_images import FAINT, RIM, Columns, _spline
 
 FINE = 2
 """Nodes of a pattern per pixel."""

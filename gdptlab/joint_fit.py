@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from gdptlab.background import Background
-from gdptlab.particle_images import Columns, ParticleImages, compiled
+from gdptlab.cores import compiled
+from gdptlab.particle_images import Columns, ParticleImages
 
 LONGEST_STEP = np.array([1.5, 1.5, 1.5, 0.2])
 """Of y, x (px), step along the stack and brightness, its share."""

@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 import pandas as pd
 from joblib import Parallel, delayed
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 from tqdm.auto import tqdm
@@ -34,6 +33,7 @@ from gdptlab.check import choice, flag, positive, real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.images import Images
 from gdptlab.overlap import Explained, Overlap
+from gdptlab.peaks import peaks
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""
@@ -47,12 +47,6 @@ chi2 by 0.1 adds 0.6 times the variance. Found as what makes errors of particles
 
 METHODS = ("correlation", "joint")
 """How `locate` can work."""
-
-BETWEEN = 0.95
-"""Share of its C_m that a peak between pixels still has at the nearest one, about, at least."""
-
-ROUNDS = 8
-"""Of the refinement's walk, at most. Most particles need one or two, a few of a crowded frame more."""
 
 BLOCK = 25
 """Consecutive frames that `batch` hands to a process: long against what it costs to hand them over."""
@@ -123,8 +117,7 @@ def locate(
     place, step, cm = place[kept], step[kept], cm[kept]
     if not refine:
         first = _pixels(image, calibration, place)
-        nearest = np.rint(step).astype(int)
-        shift = calibration.displacement(_windows(image, first, calibration.size), nearest)
+        shift = calibration.displacement(image, first, np.rint(step))
         place = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
     return _table(place, step, cm, calibration)
 
@@ -204,35 +197,12 @@ def _candidates(
     scale, near = (2, 1) if calibration.half_resolution else (1, 2)
     searched = cv2.pyrDown(image) if scale == 2 else image
     maps = calibration.correlator(searched.shape)(searched)
-    highest = maps.max(axis=0)
-    peak = (highest >= BETWEEN * threshold) & (highest == cv2.dilate(highest, np.ones((5, 5), np.uint8)))
-    # A peak on the rim of a map is the flank of one outside: its place is unknown.
-    peak[:near], peak[-near:], peak[:, :near], peak[:, -near:] = False, False, False, False
-    row, column = np.divmod(np.flatnonzero(peak), peak.shape[1])
-    around = np.arange(-near, near + 1)
-    patches = maps[:, row[:, None, None] + around[:, None], column[:, None, None] + around]
-    down, right = np.divmod(patches.reshape(len(maps), len(row), (2 * near + 1) ** 2).argmax(axis=2), 2 * near + 1)
-    each, last = np.arange(len(maps))[:, None], np.array(highest.shape)[:, None, None] - 1
-    top = np.array([row + down - near, column + right - near])
-
-    def values(i: int, j: int) -> NDArray[np.float32]:
-        """C_m in each map beside its own peak, at the rim that of the rim."""
-        y, x = np.clip(top + np.array((i, j))[:, None, None], 0, last)
-        return maps[each, y, x]
-
-    here = values(0, 0)
-    sides = [(values(-i, -j), values(i, j)) for i, j in ((1, 0), (0, 1))]
-    profile = (here + sum(_rise(before, here, after) for before, after in sides)).T
-
+    place, cm, profile = peaks(maps, threshold, near)
     likeness = _standardised(profile) @ _standardised(calibration.expected).T
     k = np.clip(likeness.argmax(axis=1), 1, len(calibration) - 2)
     step = k + _vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
-
-    best, each = profile.argmax(axis=1), np.arange(len(row))
-    part = [_vertex(np.stack([before, here, after], axis=-1)[best, each]) for before, after in sides]
-    place = top[:, best, each].T + np.stack(part, axis=1)
     middle = calibration.search_templates.shape[-1] // 2
-    return scale * (place + middle), step, profile[each, best]
+    return scale * (place + middle), step, cm
 
 
 def _pixels(image: NDArray[np.float32], calibration: Calibration, place: NDArray) -> NDArray[np.int64]:
@@ -241,54 +211,16 @@ def _pixels(image: NDArray[np.float32], calibration: Calibration, place: NDArray
     return np.clip(first, 0, np.array(image.shape) - calibration.size)
 
 
-def _windows(image: NDArray[np.float32], place: NDArray, size: int) -> NDArray[np.float32]:
-    """Windows that start at `place` (n, 2), flat and with mean 0, (n, size * size)."""
-    seen = sliding_window_view(image, (size, size))[place[:, 0], place[:, 1]].reshape(len(place), size * size)
-    return seen - seen.mean(axis=1, keepdims=True)
-
-
 def _refined(
     image: NDArray[np.float32], calibration: Calibration, place: NDArray, step: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Walk every candidate along the stack and across the pixels to its best C_m (0 if it leaves the frame)."""
-    half, last = calibration.size // 2, len(calibration) - 1
-    templates = calibration.templates.reshape(last + 1, -1)
-    first = _pixels(image, calibration, place)
-    step = np.clip(np.rint(step).astype(int), 0, last)
-    cm, shift = np.zeros(len(first)), np.zeros((len(first), 3))
-    walking, there = np.arange(len(first)), first.copy()
-    for _ in range(ROUNDS):
-        first[walking] = there
-        seen = _windows(image, there, calibration.size)
-        norm = np.linalg.norm(seen, axis=1, keepdims=True)
-        scores = seen @ templates.T / np.where(norm > 0, norm, np.inf)
-        step[walking] = k = _uphill(scores, step[walking])
-        cm[walking] = scores[np.arange(len(k)), k]
-        shift[walking] = calibration.displacement(seen, k)
-        # Not at half a pixel already, or those half-way would go to and fro.
-        move = np.where(np.abs(shift[walking, :2]) > 0.6, np.sign(shift[walking, :2]), 0).astype(int)
-        there = there + move
-        leaves = ((there < 0) | (there > np.array(image.shape) - calibration.size)).any(axis=1)
-        cm[walking[leaves]] = 0
-        on = move.any(axis=1) & ~leaves
-        walking, there = walking[on], there[on]
-        if not len(walking):
-            break
-    part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[step], -0.5, 0.5)
-    inner = (step > 0) & (step < last)
-    return first + half + np.clip(shift[:, :2], -1, 1), step + np.where(inner, part, 0), cm
-
-
-def _uphill(scores: NDArray, step: NDArray) -> NDArray:
-    """Climb along each row of `scores` (n, N) from `step` (n,) to the nearest local maximum."""
-    rows, last = np.arange(len(scores)), scores.shape[1] - 1
-    for _ in range(last):
-        around = np.clip(step[:, None] + (0, -1, 1), 0, last)
-        higher = around[rows, scores[rows[:, None], around].argmax(axis=1)]
-        if (higher == step).all():
-            break
-        step = higher
-    return step
+    last = len(calibration) - 1
+    start = _pixels(image, calibration, place), np.clip(np.rint(step), 0, last)
+    first, k, cm, shift = calibration.displacement.walk(image, *start)
+    part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[k], -0.5, 0.5)
+    inner = (k > 0) & (k < last)
+    return first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1), k + np.where(inner, part, 0), cm
 
 
 def _vertex(values: NDArray) -> NDArray:
@@ -297,14 +229,6 @@ def _vertex(values: NDArray) -> NDArray:
     bend = before + after - 2 * here
     slope = (after - before) / 2
     return np.clip(np.divide(-slope, bend, out=np.sign(slope) / 2, where=bend < 0), -0.5, 0.5)
-
-
-def _rise(before: NDArray, here: NDArray, after: NDArray) -> NDArray:
-    """How far the parabola through three values, at -1, 0 and 1, rises between them above the middle one."""
-    bend = before + after - 2 * here
-    slope = (after - before) / 2
-    top = np.clip(np.divide(-slope, bend, out=np.zeros_like(bend), where=bend < 0), -1, 1)
-    return slope * top + bend * top**2 / 2
 
 
 def _standardised(profiles: NDArray) -> NDArray:
@@ -415,7 +339,8 @@ def in_blocks(
                 yield first, len(tables), _numbered(tables, first)
         return
     jobs = (delayed(_located)(block, first, calibration, settings) for first, block in _blocks(frames, done))
-    yield from Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1")(jobs)
+    # What joblib puts into shared memory stays there until the last frame: of a long film too much.
+    yield from Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1", max_nbytes=None)(jobs)
 
 
 def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from gdptlab.particle_images import compiled
+from gdptlab.cores import compiled
 
 DEPTHS = 13
 """About as many depths are searched; the fit finds those between."""

@@ -18,12 +18,11 @@ from scipy.spatial import KDTree
 from gdptlab.background import Background
 from gdptlab.calibration import noise_level
 from gdptlab.check import real_array
-from gdptlab.cores import on_one_core
+from gdptlab.cores import compiled, on_one_core
 from gdptlab.field_calibration import MISFIT, PHOTONS, FieldCalibration
 from gdptlab.field_images import FINE, field_terms
 from gdptlab.joint_fit import JointFit, fitted
 from gdptlab.matched_filter import MatchedFilter
-from gdptlab.particle_images import compiled
 
 LEAST_GAIN = 30.0
 """In log-likelihood, of a particle (see `overlap.LEAST_GAIN`); more, as its brightness is free."""

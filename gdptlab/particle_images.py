@@ -9,11 +9,10 @@ pixel of each particle in each step of the fit.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter, spline_filter1d
 
-compiled = njit(cache=True, fastmath=True, nogil=True)
+from gdptlab.cores import compiled
 
 FAINT = 0.35
 """A particle's image ends where it stays, once smoothed, below this share of the noise of a pixel."""

@@ -435,6 +435,19 @@ def test_number_of_processes_does_not_matter(few, calibration):
     pd.testing.assert_frame_equal(one, two, check_exact=True)
 
 
+def test_a_long_film_does_not_fill_shared_memory(calibration, tmp_path, monkeypatch):
+    monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(tmp_path))
+    kept = []
+
+    def film():
+        for _ in range(3 * BLOCK):
+            kept.append(sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()))
+            yield np.zeros((600, 600), np.float32)  # of which joblib would make a file
+
+    batch(film(), calibration, n_jobs=2, progress=False)
+    assert max(kept) < 2**20
+
+
 def test_progress(few, calibration, capsys):
     batch([few[0]], calibration)
     assert "1/1" in capsys.readouterr().err
