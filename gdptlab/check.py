@@ -134,8 +134,11 @@ def real_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
         colour = array.shape[ndim:] in ((3,), (4,))
         grey = f"; for a colour image take one channel, as in {name}[..., 1]" if colour else ""
         raise ValueError(f"{name}: got shape {array.shape}, allowed are {ndim} axes, none of them empty{grey}")
+    small = array.dtype.kind != "f" and array.dtype.itemsize <= 4  # as of most cameras: nothing to look for
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(array, dtype=np.float32)
+    if small:
+        return array
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: got NaN or infinity, allowed are finite numbers that fit into float32")
     if max(array.max(), -array.min()) > LARGEST:

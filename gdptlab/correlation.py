@@ -11,6 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gdptlab.cores import compiled
+from gdptlab.spectra import good_shape, times_conjugate
 
 FLAT = 1e-4
 """A window whose contrast is below this share of the image's is taken as flat: its correlation is 0."""
@@ -48,7 +49,7 @@ class Correlator:
     def __init__(self, templates: NDArray, shape: tuple[int, int]) -> None:
         self._n = templates.shape[-1]
         # Wrapping around spoils only positions at which the template would leave the frame.
-        self._padded = tuple(cv2.getOptimalDFTSize(n) for n in shape)
+        self._padded = good_shape(shape)
         self._spectra = [cv2.dft(self._pad(t)) for t in normalised(templates)]
         self._product, self._full = np.empty((2, *self._padded), dtype=np.float32)
         rows, columns = (m - self._n + 1 for m in shape)
@@ -74,7 +75,7 @@ class Correlator:
         spectrum = cv2.dft(self._pad(image))
         per_norm = _per_norm(image, self._n)
         for map_, template in zip(self._maps, self._spectra, strict=True):
-            cv2.mulSpectrums(spectrum, template, 0, self._product, conjB=True)
+            times_conjugate(spectrum, template, self._product)
             cv2.idft(self._product, self._full, cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
             _multiply(self._full, per_norm, map_)
         return self._maps

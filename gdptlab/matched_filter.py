@@ -9,9 +9,9 @@ are explained, all of an image does.
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from gdptlab.cores import compiled
+from gdptlab.spectra import good_shape, packed, smooth_power, times_conjugate
 
 DEPTHS = 13
 """About as many depths are searched; the fit finds those between."""
@@ -39,7 +39,7 @@ class MatchedFilter:
         images = images[self._steps].astype(np.float32)
         n = images.shape[-1]
         self._half = n // 2
-        self._padded = tuple(2 * cv2.getOptimalDFTSize((side + n) // 2) for side in shape)
+        self._padded = good_shape(side + n for side in shape)
         left, values, right = np.linalg.svd(images.reshape(len(images), -1), full_matrices=False)
         self._mix = np.ascontiguousarray(left[:, :RANK] * values[:RANK], dtype=np.float32)
         singular = right[:RANK].reshape(-1, n, n).astype(np.float32)
@@ -52,6 +52,7 @@ class MatchedFilter:
         power = np.abs(spectra) ** 2 * (twice / np.prod(self._padded))
         self._power = power.reshape(len(power), -1).astype(np.float32)
         self._maps = np.empty((len(self._spectra), *self._padded), dtype=np.float32)
+        self._product = np.empty(self._padded, dtype=np.float32)
         self._products = np.empty((len(self._mix), *self._padded), dtype=np.float32)
 
     def __call__(
@@ -100,15 +101,15 @@ class MatchedFilter:
         canvas[2 * pad : 2 * pad + rows, 2 * pad : 2 * pad + columns] = residual
         spectrum = cv2.dft(canvas)
         if whiten:
-            noise_power = np.maximum(_power(spectrum) / residual.size, np.float32(noise**2))
-            spectrum /= _packed(noise_power)
+            noise_power = np.maximum(smooth_power(spectrum, SMOOTHING) / residual.size, np.float32(noise**2))
+            spectrum /= packed(noise_power)
             energy = self._power @ (1 / noise_power).ravel()
         else:
             spectrum /= np.float32(noise**2)
             energy = self._energy[:, -1, -1] / noise**2
         for map_, image in zip(self._maps, self._spectra, strict=True):
-            product = cv2.mulSpectrums(spectrum, image, 0, conjB=True)
-            cv2.idft(product, map_, flags=cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
+            times_conjugate(spectrum, image, self._product)
+            cv2.idft(self._product, map_, flags=cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
         np.matmul(self._mix, self._maps.reshape(len(self._maps), -1), out=self._products.reshape(len(self._mix), -1))
         cut = self._energy * (energy / self._energy[:, -1, -1])[:, None, None]
         known = 0.0 if np.isinf(spread) else spread**-2
@@ -122,21 +123,6 @@ class MatchedFilter:
         near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
         i, j = np.nonzero((gain > least) & (gain == cv2.dilate(gain, near)))
         return np.stack([i - pad, j - pad, self._steps[best[i, j]], bright[i, j]], axis=1).astype(float), gain[i, j]
-
-
-def _power(spectrum: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Smooth power of a spectrum that OpenCV has packed, (rows, columns / 2 + 1)."""
-    squares = spectrum**2
-    inner = squares[:, 1:-1:2] + squares[:, 2:-1:2]
-    # The outermost columns are packed in another way; their neighbours stand in for them.
-    return gaussian_filter(np.pad(inner, ((0, 0), (1, 1)), mode="edge"), SMOOTHING, mode=("wrap", "nearest"))
-
-
-def _packed(half: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Factors (rows, columns / 2 + 1) of a spectrum in OpenCV's order."""
-    out = np.repeat(half[:, 1:], 2, axis=1)
-    rows = (np.arange(len(half)) + 1) // 2
-    return np.column_stack([half[rows, 0], out[:, :-2], half[rows, -1]])
 
 
 @compiled
