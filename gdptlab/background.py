@@ -90,14 +90,15 @@ def _products(boxes, starts, values, weight, down, across, out):  # pragma: no c
             for r in range(first, y1, EVERY):
                 k = starts[i] + (r - y0) * width
                 each = np.float32(min(r + 2, y1) - max(r - 1, y0))  # it stands for its neighbours, too
+                column, trust = values[c, k:], weight[r, x0:]
                 for q in range(width):
-                    seen[q] = each * values[c, k + q] * weight[r, x0 + q]
+                    seen[q] = each * column[q] * trust[q]
                 for b in range(len(across)):
                     if across[b, x0] == 0 and across[b, x1 - 1] == 0:  # few of the splines reach the box
                         continue
-                    total = np.float32(0)
+                    total, spline = np.float32(0), across[b, x0:]
                     for q in range(width):
-                        total += seen[q] * across[b, x0 + q]
+                        total += seen[q] * spline[q]
                     for a in range(len(down)):
                         out[4 * i + c, a, b] += down[a, r] * total
 

@@ -106,7 +106,7 @@ def fitted(
     near : bool
         The places are good to a fraction of a pixel already, so that one matrix serves all steps.
     """
-    places, system = places.copy(), None
+    places, system, residual = places.copy(), None, np.empty_like(frame)
     if surface is None:
         behind = np.float32(0)
     for step in range(steps + 1):
@@ -115,9 +115,9 @@ def fitted(
         columns = shapes.draw(places[order], frame.shape)
         light = np.zeros_like(frame)
         columns.add_to(light, places[order, 3])
-        residual = frame - light
         if behind is None:
-            behind = surface.fit(residual, weight)
+            behind = surface.fit(frame - light, weight)
+        residual = np.subtract(frame, light, out=residual)
         residual -= behind
         if system is None:
             system = _System(columns, weight, spread, surface)
@@ -229,10 +229,10 @@ def _correlations(residual, brightness, boxes, starts, values):  # pragma: no co
             continue
         s = t = ss = tt = st = 0.0
         for r in range(y0, y1):
-            k = starts[i] + (r - y0) * (x1 - x0)
-            for q in range(x1 - x0):
-                image = values[3, k + q]
-                seen = residual[r, x0 + q] + light * image
+            images, rest = values[3, starts[i] + (r - y0) * (x1 - x0) :], residual[r, x0:x1]
+            for q in range(len(rest)):
+                image = images[q]
+                seen = rest[q] + light * image
                 s += seen
                 t += image
                 ss += seen * seen

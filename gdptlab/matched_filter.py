@@ -53,7 +53,6 @@ class MatchedFilter:
         self._power = power.reshape(len(power), -1).astype(np.float32)
         self._maps = np.empty((len(self._spectra), *self._padded), dtype=np.float32)
         self._product = np.empty(self._padded, dtype=np.float32)
-        self._products = np.empty((len(self._mix), *self._padded), dtype=np.float32)
 
     def __call__(
         self,
@@ -110,14 +109,13 @@ class MatchedFilter:
         for map_, image in zip(self._maps, self._spectra, strict=True):
             times_conjugate(spectrum, image, self._product)
             cv2.idft(self._product, map_, flags=cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
-        np.matmul(self._mix, self._maps.reshape(len(self._maps), -1), out=self._products.reshape(len(self._mix), -1))
         cut = self._energy * (energy / self._energy[:, -1, -1])[:, None, None]
         known = 0.0 if np.isinf(spread) else spread**-2
         gain, bright = (np.zeros((rows + 2 * pad, columns + 2 * pad), np.float32) for _ in range(2))
         best = np.zeros(gain.shape, np.int32)
         margin = int(np.clip(round(pad - outside_px), 0, pad))
         cut = cut.astype(np.float32)
-        _gain(self._products, cut, rows, columns, margin, brightness, known, share, gain, best, bright)
+        _gain(self._maps, self._mix, cut, rows, columns, margin, brightness, known, share, gain, best, bright)
 
         width = 2 * max(round(apart_px), 1) + 1
         near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
@@ -126,43 +124,54 @@ class MatchedFilter:
 
 
 @compiled
-def _gain(products, cut, rows, columns, margin, brightness, known, share, gain, best, bright):  # pragma: no cover
+def _gain(maps, mix, cut, rows, columns, margin, brightness, known, share, gain, best, bright):  # pragma: no cover
     """Highest gain over the depths at each place, with the brightness that brings it.
 
     A particle of brightness b changes minus the log-likelihood by b**2 e / 2 - b c + known (b - brightness)**2 / 2;
-    c is its product with the residual and e its energy, less where the frame's edge cuts it.
+    c is its product with the residual, mixed from those of the singular images, and e its energy, less where the
+    frame's edge cuts it.
     """
-    depths, (height, width) = len(products), gain.shape
+    depths, (height, width) = len(mix), gain.shape
     n = cut.shape[1] - 1
     half = n // 2
     aim, known = np.float32(brightness * known), np.float32(known)
     base, least = np.float32(brightness**2) * known, np.float32(share * brightness**2)
     zero, half_of = np.float32(0), np.float32(0.5)
     inverse = np.empty((depths, width), np.float32)
-    highest, argument = np.empty(width, np.float32), np.empty(width, np.int32)
+    between, product = np.empty(n + 1, np.float32), np.empty(width, np.float32)
+    highest, argument = np.empty(width - 2 * margin, np.float32), np.empty(width - 2 * margin, np.int32)
     before = (-1, -1)
     for i in range(margin, height - margin):
         top, bottom = max(0, 2 * half - i), min(n, rows - i + 2 * half)
         if (top, bottom) != before:
             before = (top, bottom)
             for z in range(depths):
+                for j in range(n + 1):
+                    between[j] = cut[z, bottom, j] - cut[z, top, j]
+                inverse[z, :] = 1 / max(between[n] + known, np.float32(1e-9))
                 for j in range(width):
+                    if 2 * half <= j <= columns - n + 2 * half:
+                        continue  # it is not cut at the left or right
                     left, right = max(0, 2 * half - j), min(n, columns - j + 2 * half)
-                    e = cut[z, bottom, right] - cut[z, top, right] - cut[z, bottom, left] + cut[z, top, left]
-                    inverse[z, j] = 1 / max(e + known, np.float32(1e-9))
+                    inverse[z, j] = 1 / max(between[right] - between[left] + known, np.float32(1e-9))
         highest[:] = 0
         argument[:] = 0
         for z in range(depths):
-            row, per = products[z, i], inverse[z]
-            for j in range(margin, width - margin):
-                c = max(row[j] + aim, zero)
+            product[:] = aim
+            for k in range(len(maps)):
+                factor, map_ = mix[z, k], maps[k, i]
+                for j in range(width):
+                    product[j] += factor * map_[j]
+            inner, per = product[margin:], inverse[z, margin:]
+            for j in range(len(highest)):  # from 0: an index that cannot be negative is far faster
+                c = max(inner[j], zero)
                 g = c * c * per[j]
                 better = g > highest[j]
                 highest[j] = g if better else highest[j]
                 argument[j] = z if better else argument[j]
-        for j in range(margin, width - margin):
-            per = inverse[argument[j], j]
+        for j in range(len(highest)):
+            per = inverse[argument[j], margin + j]
             value = half_of * (highest[j] - base)
-            gain[i, j] = value if value > half_of * least * (1 / per - known) else zero
-            best[i, j] = argument[j]
-            bright[i, j] = np.sqrt(highest[j] * per)  # c / (e + known)
+            gain[i, margin + j] = value if value > half_of * least * (1 / per - known) else zero
+            best[i, margin + j] = argument[j]
+            bright[i, margin + j] = np.sqrt(highest[j] * per)  # c / (e + known)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gdptlab.background import Background
 from gdptlab.calibration import Calibration, noise_level
+from gdptlab.cores import compiled
 from gdptlab.joint_fit import JointFit, fitted
 from gdptlab.matched_filter import MatchedFilter
 from gdptlab.particle_images import ParticleImages
@@ -318,6 +319,14 @@ def _variance(light: NDArray, residual: NDArray, noise: float, bins: int = 12) -
 
 def _weight(light: NDArray[np.float32], variance: NDArray[np.float64]) -> NDArray[np.float32]:
     """One over the variance of each pixel."""
-    square, linear, level = (np.float32(c) for c in variance)
-    light = np.abs(light)
-    return 1 / np.maximum((square * light + linear) * light + level, 0.25 * level)
+    weight = np.empty_like(light)
+    _fill_weight(light, *variance.astype(np.float32), weight)
+    return weight
+
+
+@compiled
+def _fill_weight(light, square, linear, level, weight):  # pragma: no cover
+    for r in range(light.shape[0]):
+        for c in range(light.shape[1]):
+            size = abs(light[r, c])
+            weight[r, c] = 1 / max((square * size + linear) * size + level, np.float32(0.25) * level)

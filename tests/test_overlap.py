@@ -152,15 +152,20 @@ def test_photon_noise(microscope, calibration, crowd, noisy_stack):
 
 @pytest.mark.parametrize("size", [15, 30])
 def test_what_is_no_particle(microscope, calibration, size):
-    """A bright square among particles is not reported, or with a chi2 far above theirs."""
-    true = on_grid(np.random.default_rng(244), (300, 400))
-    true = true[(true["x_px"] - 200).abs() + (true["y_px"] - 150).abs() > 60].reset_index(drop=True)
-    frame = microscope.render(true, (300, 400), rng=244).astype(float)
-    frame[150 - size // 2 : 150 - size // 2 + size, 200 - size // 2 : 200 - size // 2 + size] += 2000
-    measured = joint(frame, calibration)
-    beside = ((measured["x_px"] - 200).abs() < size) & ((measured["y_px"] - 150).abs() < size)
-    assert len(match(measured[~beside], true)) == len(true) == (~beside).sum() > 10
-    assert (measured.loc[beside, "chi2"] > 3 * measured.loc[~beside, "chi2"].median()).all()
+    """A bright square among particles is not reported, or with a chi2 far above theirs, and spoils few of them."""
+    found = reported = there = 0
+    for seed in range(244, 250):
+        true = on_grid(np.random.default_rng(seed), (300, 400))
+        true = true[(true["x_px"] - 200).abs() + (true["y_px"] - 150).abs() > 60].reset_index(drop=True)
+        frame = microscope.render(true, (300, 400), rng=seed).astype(float)
+        frame[150 - size // 2 : 150 - size // 2 + size, 200 - size // 2 : 200 - size // 2 + size] += 2000
+        measured = joint(frame, calibration)
+        beside = ((measured["x_px"] - 200).abs() < size) & ((measured["y_px"] - 150).abs() < size)
+        assert (measured.loc[beside, "chi2"] > 3 * measured.loc[~beside, "chi2"].median()).all()
+        found += len(match(measured[~beside], true))
+        reported, there = reported + (~beside).sum(), there + len(true)
+    assert found >= 0.95 * there > 60
+    assert found >= 0.95 * reported
 
 
 @pytest.mark.parametrize("shape", [(61, 75), (64, 301), (173, 90)])
