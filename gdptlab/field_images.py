@@ -121,9 +121,11 @@ def _draw(nodes, terms, places, steps, boxes, starts, values):  # pragma: no cov
             for m in range(modes):
                 t = terms[i, m]
                 n0, n1, n2, n3 = nodes[m, k, r], nodes[m, k + 1, r], nodes[m, k + 2, r], nodes[m, k + 3, r]
-                for j in range(c_first, c_last):
-                    a[j] += t * (z[0] * n0[j] + z[1] * n1[j] + z[2] * n2[j] + z[3] * n3[j])
-                    b[j] += t * (dz[0] * n0[j] + dz[1] * n1[j] + dz[2] * n2[j] + dz[3] * n3[j])
+                n0, n1, n2, n3 = n0[c_first:], n1[c_first:], n2[c_first:], n3[c_first:]
+                a0, b0 = a[c_first:], b[c_first:]
+                for j in range(c_last - c_first):
+                    a0[j] += t * (z[0] * n0[j] + z[1] * n1[j] + z[2] * n2[j] + z[3] * n3[j])
+                    b0[j] += t * (dz[0] * n0[j] + dz[1] * n1[j] + dz[2] * n2[j] + dz[3] * n3[j])
             for q in range(columns):
                 j = column + FINE * q
                 if j < 0 or j + 3 >= width:
@@ -138,11 +140,12 @@ def _draw(nodes, terms, places, steps, boxes, starts, values):  # pragma: no cov
             if j < 0 or j + 3 >= width:
                 values[:, s : s + columns] = 0
                 continue
+            j0, j1, j2, j3 = values[0, s:], values[1, s:], values[2, s:], values[3, s:]
+            c0, c1, c2, c3 = c[j], c[j + 1], c[j + 2], c[j + 3]
+            d0, d1, d2, d3 = d[j], d[j + 1], d[j + 2], d[j + 3]
+            e0, e1, e2, e3 = e[j], e[j + 1], e[j + 2], e[j + 3]
             for q in range(columns):
-                c0, c1, c2, c3 = c[j, q], c[j + 1, q], c[j + 2, q], c[j + 3, q]
-                values[0, s + q] = -fine * light * (dv0 * c0 + dv1 * c1 + dv2 * c2 + dv3 * c3)
-                values[1, s + q] = (
-                    -fine * light * (v0 * d[j, q] + v1 * d[j + 1, q] + v2 * d[j + 2, q] + v3 * d[j + 3, q])
-                )
-                values[2, s + q] = light * (v0 * e[j, q] + v1 * e[j + 1, q] + v2 * e[j + 2, q] + v3 * e[j + 3, q])
-                values[3, s + q] = v0 * c0 + v1 * c1 + v2 * c2 + v3 * c3
+                j0[q] = -fine * light * (dv0 * c0[q] + dv1 * c1[q] + dv2 * c2[q] + dv3 * c3[q])
+                j1[q] = -fine * light * (v0 * d0[q] + v1 * d1[q] + v2 * d2[q] + v3 * d3[q])
+                j2[q] = light * (v0 * e0[q] + v1 * e1[q] + v2 * e2[q] + v3 * e3[q])
+                j3[q] = v0 * c0[q] + v1 * c1[q] + v2 * c2[q] + v3 * c3[q]
