@@ -54,6 +54,7 @@ class Correlator:
         self._product, self._full = np.empty((2, *self._padded), dtype=np.float32)
         rows, columns = (m - self._n + 1 for m in shape)
         self._maps = np.empty((len(templates), rows, columns), dtype=np.float32)
+        self._per_norm = np.empty((rows, columns), dtype=np.float32)
 
     def _pad(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         rows, columns = (p - n for p, n in zip(self._padded, image.shape, strict=True))
@@ -73,34 +74,43 @@ class Correlator:
         """
         image = image - np.float32(cv2.mean(image)[0])
         spectrum = cv2.dft(self._pad(image))
-        per_norm = _per_norm(image, self._n)
+        _fill_per_norm(image, self._n, (FLAT * cv2.meanStdDev(image)[1][0, 0]) ** 2, self._per_norm)
         for map_, template in zip(self._maps, self._spectra, strict=True):
             times_conjugate(spectrum, template, self._product)
             cv2.idft(self._product, self._full, cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
-            _multiply(self._full, per_norm, map_)
+            _multiply(self._full, self._per_norm, map_)
         return self._maps
 
 
-def _per_norm(image: NDArray[np.float32], n: int) -> NDArray[np.float32]:
-    """One over the norm of every n by n window about its own mean; 0 where the window is flat.
-
-    The image's mean is near zero, so that squares lose no digits.
-    """
-    inside = slice(n // 2, image.shape[0] - (n - 1) // 2), slice(n // 2, image.shape[1] - (n - 1) // 2)
-    mean = cv2.boxFilter(image, cv2.CV_32F, (n, n))[inside]
-    square = cv2.sqrBoxFilter(image, cv2.CV_32F, (n, n))[inside]
-    flat = (FLAT * cv2.meanStdDev(image)[1][0, 0]) ** 2
-    per_norm = np.empty(mean.shape, dtype=np.float32)
-    _invert(mean, square, np.float32(flat), n, per_norm)
-    return per_norm
-
-
 @compiled
-def _invert(mean, square, flat, n, per_norm):  # pragma: no cover
-    for r in range(per_norm.shape[0]):
-        for c in range(per_norm.shape[1]):
-            variance = square[r, c] - mean[r, c] * mean[r, c]
-            per_norm[r, c] = np.float32(1) / (np.float32(n) * np.sqrt(variance)) if variance > flat else np.float32(0)
+def _fill_per_norm(image, n, flat, per_norm):  # pragma: no cover
+    """One over the norm of every n by n window about its own mean; 0 where its variance is at most `flat`.
+
+    Sums over n rows go down the image and sums of those over n columns to the right.
+    """
+    rows, columns = image.shape
+    sums, squares, norms = np.zeros(columns), np.zeros(columns), np.empty(columns - n + 1, np.float32)
+    least = np.float32(n * n * flat)
+    for r in range(rows):
+        row = image[r]
+        for c in range(columns):
+            sums[c] += row[c]
+            squares[c] += np.float64(row[c]) * row[c]
+        if r >= n - 1:
+            total, square = sums[: n - 1].sum(), squares[: n - 1].sum()
+            next_sums, next_squares, out = sums[n - 1 :], squares[n - 1 :], per_norm[r - n + 1]
+            for c in range(len(norms)):
+                total += next_sums[c]
+                square += next_squares[c]
+                norms[c] = square - total * total / (n * n)
+                total -= sums[c]
+                square -= squares[c]
+            for c in range(len(norms)):
+                out[c] = 1 / np.sqrt(norms[c]) if norms[c] > least else np.float32(0)
+            row = image[r - n + 1]
+            for c in range(columns):
+                sums[c] -= row[c]
+                squares[c] -= np.float64(row[c]) * row[c]
 
 
 @compiled

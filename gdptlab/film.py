@@ -191,7 +191,8 @@ class Film:
             raise ValueError(f"table: got columns {list(table)}, needed are x_px and y_px")
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2
         stds = {f"{a}_std_um": table[f"{a}_std_px"] * scale for a in "xy" if f"{a}_std_px" in table}
-        return table.assign(x_um=(table["x_px"] + 0.5) * scale, y_um=(table["y_px"] - middle) * scale, **stds)
+        x_px, y_px = table["x_px"].to_numpy(), table["y_px"].to_numpy()
+        return table.assign(x_um=(x_px + 0.5) * scale, y_um=(y_px - middle) * scale, **stds)
 
     def _to_pixels(self, table: pd.DataFrame) -> pd.DataFrame:
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2

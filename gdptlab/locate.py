@@ -25,7 +25,6 @@ import numpy as np
 import pandas as pd
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
 from gdptlab.calibration import Calibration
@@ -33,7 +32,7 @@ from gdptlab.check import choice, flag, positive, real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.images import Images
 from gdptlab.overlap import Explained, Overlap
-from gdptlab.peaks import peaks
+from gdptlab.peaks import peaks, strongest
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""
@@ -113,7 +112,7 @@ def locate(
     place, step, cm = _candidates(image, calibration, threshold)
     if flag("refine", refine):
         place, step, cm = _refined(image, calibration, place, step)
-    kept = _strongest(place, np.where(cm >= threshold, cm, 0), distance)
+    kept = strongest(place, np.where(cm >= threshold, cm, 0), distance)
     place, step, cm = place[kept], step[kept], cm[kept]
     if not refine:
         first = _pixels(image, calibration, place)
@@ -236,18 +235,6 @@ def _standardised(profiles: NDArray) -> NDArray:
     centred = profiles - profiles.mean(axis=1, keepdims=True)
     norm = np.linalg.norm(centred, axis=1, keepdims=True)
     return centred / np.where(norm > 0, norm, 1)
-
-
-def _strongest(place: NDArray, cm: NDArray, distance: float) -> NDArray[np.int64]:
-    """Indices by falling C_m, without those nearer than `distance` to a stronger one, or with none."""
-    near = KDTree(place).query_ball_point(place, distance) if len(place) else []
-    taken = cm <= 0
-    kept = []
-    for i in np.argsort(-cm, kind="stable"):
-        if not taken[i]:
-            kept.append(i)
-            taken[near[i]] = True
-    return np.array(kept, dtype=np.int64)
 
 
 def batch(

@@ -30,7 +30,7 @@ from gdptlab.channel import Channel
 from gdptlab.check import choice, positive, real_array, whole
 from gdptlab.logbook import Logbook
 from gdptlab.own_process import as_text
-from gdptlab.replay import fractions
+from gdptlab.replay import in_middle_third
 
 DIGITS = 3
 """Decimals of a particle's numbers in the log."""
@@ -113,8 +113,8 @@ class MiddleThird:
 
     def __call__(self, table: pd.DataFrame) -> float:
         """Share, from 0 to 1; NaN without particles."""
-        seen = fractions(self.to_channel(table).assign(frame=0), [0], self.channel)
-        return float(seen[f"fraction_{self.of}"].iloc[0])
+        inside = in_middle_third(self.to_channel(table), self.of, self.channel)
+        return float(inside.mean()) if len(inside) else np.nan
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,22 +45,45 @@ def peaks(
     return tops[np.arange(len(at)), profile.argmax(axis=1)], profile.max(axis=1), profile
 
 
+def strongest(place: NDArray[np.float64], cm: NDArray, distance_px: float) -> NDArray[np.int64]:
+    """Indices by falling C_m (n,), without those nearer than this to a stronger one, or with none; of places (n, 2)."""
+    order = np.argsort(-cm, kind="stable")
+    return _apart(place, order[cm[order] > 0], distance_px**2)
+
+
+@compiled
+def _apart(place, order, square):  # pragma: no cover
+    kept, n = np.empty(len(order), np.int64), 0
+    for i in order:
+        alone = True
+        for k in kept[:n]:
+            y, x = place[i, 0] - place[k, 0], place[i, 1] - place[k, 1]
+            if y * y + x * x <= square:
+                alone = False
+                break
+        if alone:
+            kept[n] = i
+            n += 1
+    return kept[:n].copy()
+
+
 @compiled
 def _peaks(highest, threshold, rim):  # pragma: no cover
     """Rows and columns (n, 2) of the local maxima."""
     rows, columns = highest.shape
     found = []
     for r in range(rim, rows - rim):
-        for c in range(rim, columns - rim):
-            here = highest[r, c]
-            if here < threshold:
+        before, row, after = highest[r, rim - 1 :], highest[r, rim:], highest[r, rim + 1 :]
+        for q in range(columns - 2 * rim):
+            here = row[q]
+            if here < threshold or here < before[q] or here < after[q]:
                 continue
-            top = True
+            c = rim + q
             for y in range(max(r - APART_PX, 0), min(r + APART_PX + 1, rows)):
-                for x in range(max(c - APART_PX, 0), min(c + APART_PX + 1, columns)):
-                    if highest[y, x] > here:
-                        top = False
-            if top:
+                around = highest[y, max(c - APART_PX, 0) : c + APART_PX + 1]
+                if around.max() > here:
+                    break
+            else:
                 found.append((r, c))
     at = np.empty((len(found), 2), np.int64)
     for i in range(len(found)):

@@ -17,7 +17,8 @@ from skimage.feature import match_template
 
 from gdptlab.calibration import Calibration
 from gdptlab.check import choice
-from gdptlab.locate import _checked, _standardised, _strongest, _table, _vertex
+from gdptlab.locate import _checked, _standardised, _table, _vertex
+from gdptlab.peaks import strongest
 
 REACH_PX = 2
 """How far from a candidate's pixel the refinement looks."""
@@ -84,7 +85,7 @@ def locate_plainly(
         found = [(*_top(maps[b], r, c), s) for b, r, c, s in zip(best, row, column, step, strict=True)]
     y, x, cm, step = np.array(found).reshape(-1, 4).T
     place = np.stack([y, x], axis=1) + half
-    kept = _strongest(place, np.where(cm >= threshold, cm, 0), distance)
+    kept = strongest(place, np.where(cm >= threshold, cm, 0), distance)
     return _table(place[kept], step[kept], cm[kept], calibration)
 
 

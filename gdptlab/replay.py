@@ -331,14 +331,19 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
     table = table[table["frame"].isin(frames)]
     place = np.searchsorted(frames, table["frame"])
     count = np.bincount(place, minlength=len(frames))
-    inside = {"fraction_h": table["z_um"].abs() <= channel.height_um / 6}
-    inside |= {"fraction_w": table["y_um"].abs() <= channel.width_um / 6}
+    inside = {f"fraction_{of}": in_middle_third(table, of, channel) for of in "hw"}
     empty = np.where(count > 0, 0.0, np.nan)
     shares = {
         name: np.bincount(place, weights=yes, minlength=len(frames)) / np.maximum(count, 1) + empty
         for name, yes in inside.items()
     }
     return pd.DataFrame({"frame": frames, "count": count} | shares)
+
+
+def in_middle_third(table: pd.DataFrame, of: str, channel: Channel) -> NDArray[np.bool_]:
+    """Which particles, of a table in channel coordinates, have |z| ≤ h/6 (of 'h') or |y| ≤ w/6 (of 'w')."""
+    column, size_um = {"h": ("z_um", channel.height_um), "w": ("y_um", channel.width_um)}[of]
+    return np.abs(table[column].to_numpy()) <= size_um / 6
 
 
 def trigger_time(times_s: ArrayLike, fraction: ArrayLike, level: float = 0.9) -> float:
