@@ -119,10 +119,10 @@ def _look(image, top, left, seen):  # pragma: no cover
     n = int(np.sqrt(len(seen)))
     total = np.float32(0)
     for r in range(n):
-        for c in range(n):
-            seen[r * n + c] = image[top + r, left + c]
-        for c in range(n):
-            total += seen[r * n + c]
+        row, copy = image[top + r, left:], seen[r * n :]
+        for c in range(n):  # from 0: an index that cannot be negative is far faster
+            copy[c] = row[c]
+            total += row[c]
     mean = np.float32(total / len(seen))
     for i in range(len(seen)):
         seen[i] -= mean

@@ -117,6 +117,31 @@ class MiddleThird:
         return float(inside.mean()) if len(inside) else np.nan
 
 
+def middle_thirds(channel: Channel, to_channel: Callable[[pd.DataFrame], pd.DataFrame]) -> dict[str, MiddleThird]:
+    """Of height and width, by 'h' and 'w': two that convert a frame's table once.
+
+    Parameters
+    ----------
+    channel, to_channel
+        As of `MiddleThird`.
+
+    Raises
+    ------
+    TypeError
+        If one is not of its kind.
+    """
+    _function("to_channel", to_channel)
+    last: tuple[pd.DataFrame | None, pd.DataFrame | None] = (None, None)
+
+    def converted(table: pd.DataFrame) -> pd.DataFrame:
+        nonlocal last
+        if table is not last[0]:
+            last = table, to_channel(table)
+        return last[1]
+
+    return {of: MiddleThird(of=of, channel=channel, to_channel=converted) for of in "hw"}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Trigger:
     """When to act.
@@ -128,7 +153,7 @@ class Trigger:
     ----------
     name : str
     share : callable
-        Table of the evaluator -> number, such as `MiddleThird`. A NaN changes nothing.
+        Table of the evaluator -> number, such as a `MiddleThird`. A NaN changes nothing.
     action : callable
         Called with the `Result` when the trigger goes on, in the evaluating thread: the next frame waits for it.
     released : callable, optional

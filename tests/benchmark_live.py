@@ -14,7 +14,7 @@ from gdptlab.channel import Acoustics, Focusing
 from gdptlab.device import Device, closed_loop
 from gdptlab.files import written_whole
 from gdptlab.film import Film
-from gdptlab.monitor import MiddleThird, Monitor, Status, Trigger
+from gdptlab.monitor import Monitor, Status, Trigger, middle_thirds
 from gdptlab.own_process import OwnProcess
 from gdptlab.replay import Method
 
@@ -48,8 +48,7 @@ def peak_mb() -> float:
 def watched(device: Device, film: Film, evaluate: object) -> tuple[Status, float]:
     """Status of a monitor after the film, and MB by which the peak of memory rose."""
     channel = film.trajectories.focusing.channel
-    thirds = [MiddleThird(of=of, channel=channel, to_channel=film.to_channel) for of in "hw"]
-    triggers = [Trigger(name=third.of, share=third, action=str) for third in thirds]
+    triggers = [Trigger(name=of, share=s, action=str) for of, s in middle_thirds(channel, film.to_channel).items()]
     example, before = film[0], peak_mb()
     device.run(film, ahead=min(AHEAD, len(film)))
     with Monitor(device, evaluate, triggers, example=example) as monitor:

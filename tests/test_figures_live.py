@@ -12,7 +12,7 @@ import pytest
 
 from gdptlab import figures_live
 from gdptlab.channel import Channel
-from gdptlab.monitor import MiddleThird, Monitor, Trigger
+from gdptlab.monitor import Monitor, Trigger, middle_thirds
 
 CHANNEL = Channel(width_um=120, height_um=60)
 
@@ -35,7 +35,7 @@ def seen(image):
 
 @pytest.fixture
 def monitor():
-    thirds = [MiddleThird(of=of, channel=CHANNEL, to_channel=to_channel) for of in "hw"]
+    thirds = middle_thirds(CHANNEL, to_channel).values()
     triggers = [Trigger(name=third.of, share=third, action=str) for third in thirds]
     frames = iter([np.full((90, 40), n, np.uint8) for n in (4, 9)])
     monitor = Monitor(lambda: slowly(monitor, frames), seen, triggers)
