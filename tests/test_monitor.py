@@ -18,7 +18,7 @@ import pytest
 from gdptlab import locate, logbook, replay
 from gdptlab.channel import Channel
 from gdptlab.logbook import Logbook, read_log
-from gdptlab.monitor import Frame, MiddleThird, Monitor, Trigger, at_speed
+from gdptlab.monitor import Frame, MiddleThird, Monitor, Trigger, at_speed, middle_thirds
 from gdptlab.own_process import OwnProcess
 
 SHAPE = (3, 5)
@@ -222,6 +222,20 @@ def test_the_middle_third_is_that_of_the_replay():
         share = MiddleThird(of=of, channel=channel, to_channel=lambda t: t.assign(y_um=t["y"]))
         assert share(table) == expected[f"fraction_{of}"] > 0.1
         assert np.isnan(share(table[:0]))
+
+
+def test_both_thirds_convert_a_table_once():
+    channel, calls = Channel(width_um=90, height_um=60), []
+
+    def to_channel(table):
+        calls.append(len(table))
+        return table.assign(y_um=table["y"])
+
+    thirds = middle_thirds(channel, to_channel)
+    for rows in (3, 2):
+        table = pd.DataFrame({"y": [0.0, 40, 40][:rows], "z_um": [0.0, 0, 30][:rows]})
+        assert {of: third(table) for of, third in thirds.items()} == {"h": 2 / rows, "w": 1 / rows}
+    assert calls == [3, 2]
 
 
 # -------------------- what goes wrong
@@ -546,6 +560,7 @@ def test_a_process_of_its_own_finds_the_same(few, calibration):
         (lambda: MiddleThird(of="x", channel=Channel(), to_channel=ten), ValueError, "of: got 'x'"),
         (lambda: MiddleThird(of="h", channel=3, to_channel=ten), TypeError, "channel: got 3"),
         (lambda: MiddleThird(of="h", channel=Channel(), to_channel=3), TypeError, "to_channel: got 3"),
+        (lambda: middle_thirds(Channel(), 3), TypeError, "to_channel: got 3"),
     ],
 )
 def test_bad_input_is_refused(call, error, words):
