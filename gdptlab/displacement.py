@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from gdptlab.cores import compiled
+from gdptlab.cores import compiled, inlined
 
 # Central differences of order 0 to 3, of Stirling's interpolation formula.
 DIFFERENCES = ([1.0], [-0.5, 0.0, 0.5], [1.0, -2.0, 1.0], [-0.5, 1.0, 0.0, -1.0, 0.5])
@@ -105,7 +105,7 @@ def _difference(images: NDArray, order_y: int, order_x: int) -> NDArray:
     return images
 
 
-@compiled
+@inlined
 def _dot(a, b):  # pragma: no cover
     total = np.float32(0)
     for i in range(len(a)):
@@ -113,7 +113,7 @@ def _dot(a, b):  # pragma: no cover
     return total
 
 
-@compiled
+@inlined
 def _look(image, top, left, seen):  # pragma: no cover
     """Copy a window into `seen` (n * n,) and take its mean away. Its norm."""
     n = int(np.sqrt(len(seen)))
@@ -129,7 +129,7 @@ def _look(image, top, left, seen):  # pragma: no cover
     return np.sqrt(_dot(seen, seen))
 
 
-@compiled
+@inlined
 def _displaced(seen, rows, curved, rounds, shift):  # pragma: no cover
     """Write dy, dx, dz of a window against the template of these `rows` (4, n * n), `curved` (4, terms)."""
     products, solution = np.empty(4), np.empty(4)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter, spline_filter1d
 
-from gdptlab.cores import compiled
+from gdptlab.cores import compiled, inlined
 
 FAINT = 0.35
 """A particle's image ends where it stays, once smoothed, below this share of the noise of a pixel."""
@@ -144,7 +144,7 @@ def _reach(images: NDArray, noise: float) -> NDArray[np.int64]:
     return np.minimum(median_filter(np.stack(reach, axis=1), (5, 1), mode="nearest") + 1, half)
 
 
-@compiled
+@inlined
 def _spline(f):  # pragma: no cover
     """Weights, and their derivatives, of the four nodes around a point at `f` between the middle two."""
     g = 1 - f

@@ -6,7 +6,7 @@ The kernels are compiled (numba), as they touch every pixel.
 import numpy as np
 from numpy.typing import NDArray
 
-from gdptlab.cores import compiled
+from gdptlab.cores import compiled, inlined
 
 BETWEEN = 0.95
 """Share of its C_m that a peak between pixels still has at the nearest one, about, at least."""
@@ -91,7 +91,7 @@ def _peaks(highest, threshold, rim):  # pragma: no cover
     return at
 
 
-@compiled
+@inlined
 def _parabola(before, here, after):  # pragma: no cover
     """Where the parabola through three values, at -1, 0 and 1, has its top, and how far that is above the middle."""
     bend = before + after - 2 * here
