@@ -4,6 +4,9 @@ The scan is one of a plane of beads (dried on a slide, say) that the stage carri
 slice where they are sharpest each is a small spot, bright or dark, and easy to find. Those that stand alone, are not
 clipped and look like the rest are moved to a common centre and depth and averaged: beads are as good as
 exposures, so noise falls with their number. What was chosen, and why, is in the result.
+
+Some optics make several spots of one bead, even in focus (astigmatism with spherical aberration: two). Spots of one
+bead are told from neighbours by their distance and direction, which are the same all over the scan.
 """
 
 from dataclasses import dataclass
@@ -11,11 +14,22 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter, maximum_filter, shift
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter, shift
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from gdptlab.assess import match
-from gdptlab.calibration import LARGEST, Calibration, _centred, _depths, _image_size, denoised, levelled, noise_level
+from gdptlab.calibration import (
+    LARGEST,
+    Calibration,
+    _centred,
+    _depths,
+    _image_size,
+    denoised,
+    levelled,
+    noise_level,
+)
 from gdptlab.check import real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.correlation import normalised
@@ -39,6 +53,15 @@ COVERED = 0.9
 
 LEAST = 7
 """Frames of a scan."""
+
+MOST_APART = 60
+"""Of spots that may belong to one bead, px."""
+
+SPOT = 10
+"""Rows and columns about a bead's place in which its brightest spot is looked for."""
+
+SAME = 2.0
+"""Radius, px, within which the steps from spot to spot are the same."""
 
 SHARES = (1.0, 0.9, 0.8, 0.7)
 """Of the widest image, tried as the size of a template."""
@@ -232,7 +255,30 @@ def _found(overview: NDArray[np.float32]) -> pd.DataFrame:
         width = float(np.median([_half_width(sign * overview, x[i], y[i]) for i in top]))
         spots = gaussian_filter(sign * overview, max(1, width / 2))
     places = np.array([_centroid(sign * overview, *place, 1 + int(width)) for place in zip(x, y, strict=True)])
-    return _table(overview, places)
+    bead = _bead_of(places)
+    weight = spots[y, x] - level
+    total = np.bincount(bead, weight)
+    return _table(overview, np.stack([np.bincount(bead, weight * p) / total for p in places.T], axis=1))
+
+
+def _bead_of(places: NDArray) -> NDArray[np.int64]:
+    """Number of the bead that each spot at `places` (n, 2) belongs to.
+
+    A step from spot to spot that a fifth of them or more share, far more often than by chance, leads from one spot of
+    a bead to another. In a regular array of beads a step leads on to a third one, and is not taken.
+    """
+    pairs = KDTree(places).query_pairs(MOST_APART, output_type="ndarray")
+    steps = places[pairs[:, 1]] - places[pairs[:, 0]]
+    back = (steps[:, 0] < 0) | ((steps[:, 0] == 0) & (steps[:, 1] < 0))
+    steps[back] *= -1
+    by_chance = 2 * len(steps) * (SAME / MOST_APART) ** 2
+    joined = np.zeros(len(pairs), dtype=bool)
+    for same in KDTree(steps).query_ball_point(steps, SAME) if len(steps) else ():
+        spots = np.unique(pairs[same])
+        if len(same) >= max(3, len(places) / 5, 10 * by_chance) and len(spots) > 1.8 * len(same):
+            joined[same] = True
+    links = coo_array((np.ones(joined.sum()), pairs[joined].T), shape=(len(places), len(places)))
+    return connected_components(links, directed=False)[1]
 
 
 def _half_width(spot: NDArray, x: int, y: int, most: int = 30) -> float:
@@ -257,7 +303,9 @@ def _table(overview: NDArray[np.float32], places: NDArray) -> pd.DataFrame:
         raise ValueError(f"beads_px: got {places[border.argmin()]}, allowed are places in the frames")
     nearest = KDTree(places).query(places, k=2)[0][:, 1]
     column, row = (np.rint(p).astype(int) for p in (x, y))
-    height = gaussian_filter(overview, 1)[row, column]
+    smooth = gaussian_filter(overview, 1)
+    high, low = (extreme(smooth, 2 * SPOT + 1)[row, column] for extreme in (maximum_filter, minimum_filter))
+    height = np.where(high > -low, high, low)
     table = pd.DataFrame({"x_px": x, "y_px": y, "brightness": height, "room_px": np.minimum(nearest, 2 * border)})
     return table.sort_values("brightness", key=np.abs, ascending=False, ignore_index=True)
 
@@ -320,7 +368,8 @@ def _averaged(
     if not len(looked):
         raise ValueError(
             f"scan: got {len(beads)} beads, none with {size} px to the next and {size // 2 + 2} to the border, needed "
-            "is one; give a smaller size, or the place of one in beads_px, or scan a sparser slide"
+            "is one; give a smaller size, or the place of one in beads_px (also if one bead's spots are taken "
+            "for several), or scan a sparser slide"
         )
     clipped = _clipped(scan, beads.loc[looked], size)
     beads.loc[looked, "clipped"] = clipped.sum(axis=1)

@@ -37,8 +37,20 @@ VERSION = 1
 LARGEST = 121
 """Rows and columns, px, beyond which no size is chosen for a template unasked."""
 
+WINDOW = 11
+"""Images that are filtered together."""
+
+SMOOTHED = (0.7, 1.5, 1.5)
+"""Frequencies along z and in the image (every other one) over which the power of a window's spectrum is smoothed."""
+
 REPEATS = 4
 """Of making the calibration again, to see what noise does to it."""
+
+RECENTRED = 4
+"""How often, at most, a particle is cut out anew about the centre that was found."""
+
+STANDS_OUT = 4.0
+"""Height of a particle, over the noise of a pixel, from which on it is one."""
 
 LOSSLESS = 0.98
 """Templates that keep this correlation with themselves at half resolution are searched for there."""
@@ -159,7 +171,7 @@ class Calibration:
         z_um : array (N,)
             Depths, strictly increasing or decreasing.
         x_px, y_px : float
-            About where the particle is (to a few pixels).
+            About where the particle is (to a few pixels), with x to the right and y down from the first pixel.
         size : int, optional
             Rows and columns of the templates, odd. Without it, the smallest that holds the widest image.
         n_sub, n, denoise
@@ -168,29 +180,59 @@ class Calibration:
         Raises
         ------
         TypeError, ValueError
-            As `from_stack`; also if the particle is nearer to the border than half a template.
+            As `from_stack`; also if the particle is nearer to the border than half a template, or nothing at that
+            place stands out of the noise.
         """
         scan, z_um = real_array("scan", scan, 3), _depths(z_um)
         if len(z_um) != len(scan):
             raise ValueError(f"z_um: got {len(z_um)} depths, needed is one for each of {len(scan)} frames")
         rows, columns = scan.shape[1:]
         x_px, y_px = positive("x_px", x_px, zero=True), positive("y_px", y_px, zero=True)
-        room = int(min(x_px, y_px, columns - 1 - x_px, rows - 1 - y_px)) - 2
-        where = f"a particle at x_px = {x_px:g}, y_px = {y_px:g} in frames of {columns} by {rows} px"
-        if room < 1:
-            raise ValueError(f"x_px, y_px: got {where}, allowed is one 3 px or more inside")
-        largest = 2 * room + 1
-        if size is None:
-            size = _image_size(_cut(scan, x_px, y_px, min(room, LARGEST // 2)))
-        if not isinstance(size, Integral) or isinstance(size, bool):
+        if size is not None and (not isinstance(size, Integral) or isinstance(size, bool)):
             raise TypeError(f"size: got {size!r}, allowed are odd whole numbers")
-        if not 3 <= size <= largest or size % 2 == 0:
-            raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {largest} for {where}")
-        stack, _ = _centred(scan, z_um, x_px, y_px, size, room)
-        return cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
+        given = size
+        for _ in range(RECENTRED):
+            room = int(min(x_px, y_px, columns - 1 - x_px, rows - 1 - y_px)) - 2
+            where = f"a particle at x_px = {x_px:g}, y_px = {y_px:g} in frames of {columns} by {rows} px"
+            if room < 1:
+                raise ValueError(f"x_px, y_px: got {where}, allowed is one 3 px or more inside")
+            if given is None:
+                half = min(room, LARGEST // 2)
+                size = _image_size(_cut(scan, x_px, y_px, half))
+                if size >= 2 * half - 1 and half == room:
+                    raise ValueError(f"x_px, y_px: got {where}, whose images reach the border: allowed is one inside")
+            if not 3 <= size <= 2 * room + 1 or size % 2 == 0:
+                raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {2 * room + 1} for {where}")
+            stack, centres = _centred(scan, z_um, x_px, y_px, size, room)
+            away = centres.mean(axis=0) - (x_px, y_px)
+            if np.abs(away).max() <= 1:
+                break
+            x_px, y_px = np.clip(centres.mean(axis=0), 0, (columns - 1, rows - 1)).tolist()
+        calibration = cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
+        calibration._must_stand_out(where)
+        return calibration
+
+    def _must_stand_out(self, where: str) -> None:
+        """Refuse a stack in whose middle is no particle, or with a brighter one beside it."""
+        noise, edge = max(noise_level(self.stack), 1e-9), self.size // 4
+        smooth = denoised(self.stack)
+        height = np.abs(smooth - np.median(smooth, axis=(1, 2), keepdims=True)).max(axis=0) / noise
+        inside = height[edge:-edge, edge:-edge].max()
+        if inside < max(STANDS_OUT, height.max() / 2):
+            raise ValueError(
+                f"x_px, y_px: got {where}, where nothing stands out by more than {inside:.1f} times the noise (beside "
+                f"it, by {height.max():.1f}); needed is a particle, alone, that does so by {STANDS_OUT:g}"
+            )
 
     def __len__(self) -> int:
         return len(self.stack)
+
+    def __repr__(self) -> str:
+        z_um, ratio = self.z_um, self.signal_to_noise()
+        return (
+            f"<Calibration: {len(self)} images of {self.size} by {self.size} px, z = {z_um[0]:g} to {z_um[-1]:g} µm, "
+            f"{len(self.subset)} in the subset, signal / noise {ratio.min():.0f} to {ratio.max():.0f}>"
+        )
 
     @property
     def size(self) -> int:
@@ -299,9 +341,12 @@ class Calibration:
         """What the noise of the stack does to positions measured with it: RMS error (N, 3) of x, y (px) and z (µm).
 
         The error is that of every particle at that depth, so it does not average out. It is found by making
-        the calibration again, from its own images with fresh noise of the stack's strength.
+        the calibration again, from its own images with fresh noise like the stack's, which may grow with the light.
         """
-        truth, noise = self.images.astype(np.float64), noise_level(self.stack)
+        truth = self.images.astype(np.float64)
+        light, rest = np.abs(truth), self.stack - denoised(self.stack)
+        per_count = max(np.polyfit(light.ravel(), rest.ravel() ** 2, 1)[0], 0)
+        noise = np.sqrt(noise_level(self.stack) ** 2 + per_count * light)
         rows = np.linalg.pinv(self._columns)[:, :3]
         errors = []
         for seed in range(REPEATS):
@@ -406,6 +451,21 @@ class Calibration:
         return cls(**data)
 
 
+def checked(calibration: object) -> Calibration:
+    """Return `calibration` if it is one.
+
+    Raises
+    ------
+    TypeError
+        If not.
+    """
+    if isinstance(calibration, Calibration):
+        return calibration
+    inner = isinstance(getattr(calibration, "calibration", None), Calibration)
+    advice = "; that is its attribute `calibration`" if inner else ""
+    raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration{advice}")
+
+
 def _middles(n: int, n_sub: int) -> NDArray[np.int64]:
     """Indices of the images in the middle of n_sub equal bins of n."""
     return ((np.arange(n_sub) + 0.5) * (n - 1) / n_sub + 0.5).astype(np.int64)  # to the nearest
@@ -422,11 +482,12 @@ def _depths(z_um: ArrayLike) -> NDArray[np.float64]:
 
 
 def denoised(stack: NDArray) -> NDArray[np.float32]:
-    """Smooth model of a stack: low rank, then Wiener-filtered along z and in each image.
+    """Smooth model of a stack: a Wiener filter along z and in the image, in windows along z.
 
-    Singular images are kept while they stand out of the noise (the largest singular value of a matrix of noise
-    alone is about sigma (sqrt(N) + sqrt(pixels))). White noise of known strength is left in their coefficients
-    and in every image; it is filtered out by what the cosine spectrum of each holds above it.
+    From window to window it follows how bright and how sharp the images are. Even and odd frequencies of the
+    cosine transform are the symmetric and the antisymmetric part of an image and are filtered each for itself:
+    a particle that is its own mirror image has nothing in three of the four parts, and three quarters of the noise
+    go with them.
 
     Parameters
     ----------
@@ -436,28 +497,24 @@ def denoised(stack: NDArray) -> NDArray[np.float32]:
     -------
     float32 array (N, n, n)
     """
-    flat = stack.reshape(len(stack), -1).astype(np.float64)
-    means = flat.mean(axis=1, keepdims=True)
-    left, values, right = np.linalg.svd(flat - means, full_matrices=False)
-    noise = noise_level(stack)
-    kept = max(int(np.sum(values > noise * (np.sqrt(flat.shape[0]) + np.sqrt(flat.shape[1])))), 1)
-    coefficients = _wiener((left[:, :kept] * values[:kept]).T, noise**2)
-    images = (coefficients.T @ right[:kept] + means).reshape(stack.shape)
-    share = (left[:, :kept] ** 2).sum(axis=1)  # of the noise of each image that the singular images carry
-    return _wiener(images, share[:, None, None] * noise**2).astype(np.float32)
-
-
-def _wiener(signals: NDArray, noise_variance: float | NDArray) -> NDArray:
-    """Wiener filter for each of `signals` (k, ...) with white noise, in the basis of cosines.
-
-    The power spectrum is the signal's own, smoothed. As that still scatters by a quarter, half as much noise
-    again is taken from it, so that of noise alone next to nothing is left.
-    """
-    axes = tuple(range(1, signals.ndim))
-    spectra = dctn(signals, axes=axes, norm="ortho")
-    power = gaussian_filter(spectra**2, (0, *(2 for _ in axes)), mode="nearest")
-    gain = 1 - np.minimum(1.5 * noise_variance / np.where(power > 0, power, 1), 1)
-    return idctn(spectra * gain, axes=axes, norm="ortho")
+    noise, count = noise_level(stack), min(WINDOW, len(stack))
+    middle = np.abs(np.arange(count) - (count - 1) / 2)
+    trust = (1 - middle / ((count + 1) / 2)).astype(np.float32)[:, None, None] ** 2
+    # Polynomials, not cosines, as images still change at the ends of a window.
+    along_z = np.linalg.qr(np.vander(np.linspace(-1, 1, count), increasing=True))[0].astype(np.float32)
+    levels = stack.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
+    spectra = dctn((stack - levels).astype(np.float32), axes=(1, 2), norm="ortho")
+    smooth, weight = np.zeros_like(spectra), np.zeros((len(stack), 1, 1), dtype=np.float32)
+    for k in range(len(stack) - count + 1):
+        window = np.einsum("zp,zij->pij", along_z, spectra[k : k + count])
+        for part in (window[:, i::2, j::2] for i in (0, 1) for j in (0, 1)):
+            # The power is the signal's own, smoothed. As that still scatters, half as much noise again is taken
+            # from it, so that of noise alone next to nothing is left.
+            power = gaussian_filter(part**2, SMOOTHED, mode="nearest")
+            part *= 1 - np.minimum(1.5 * noise**2 / np.where(power > 0, power, 1), 1)
+        smooth[k : k + count] += trust * np.einsum("zp,pij->zij", along_z, window)
+        weight[k : k + count] += trust
+    return (idctn(smooth / weight, axes=(1, 2), norm="ortho") + levels).astype(np.float32)
 
 
 def levelled(images: NDArray) -> NDArray:

@@ -132,8 +132,10 @@ def real_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
         raise TypeError(f"{name}: got values of type {array.dtype}, allowed are real numbers")
     if array.ndim != ndim or 0 in array.shape:
         colour = array.shape[ndim:] in ((3,), (4,))
-        grey = f"; for a colour image take one channel, as in {name}[..., 1]" if colour else ""
-        raise ValueError(f"{name}: got shape {array.shape}, allowed are {ndim} axes, none of them empty{grey}")
+        advice = f"; for a colour image take one channel, as in {name}[..., 1]" if colour else ""
+        if array.ndim == ndim + 1 and array.size and not colour:
+            advice = f"; of a film or a stack take one image, as in {name}[0]"
+        raise ValueError(f"{name}: got shape {array.shape}, allowed are {ndim} axes, none of them empty{advice}")
     small = array.dtype.kind != "f" and array.dtype.itemsize <= 4  # as of most cameras: nothing to look for
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(array, dtype=np.float32)

@@ -20,7 +20,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial import KDTree
 
 from gdptlab.background import Background
-from gdptlab.calibration import Calibration, _depths, noise_level
+from gdptlab.calibration import Calibration, _depths, checked, noise_level
 from gdptlab.check import real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.field_images import FINE, FieldImages, field_terms
@@ -145,8 +145,7 @@ class FieldCalibration:
     @classmethod
     def from_one(cls, calibration: Calibration) -> Self:
         """Of a calibration with one particle: the same pattern everywhere, a flat focal surface."""
-        if not isinstance(calibration, Calibration):
-            raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration")
+        checked(calibration)
         images = calibration.images
         m = FINE * (calibration.size - 1) + 1
         fine = np.stack([cv2.resize(image, None, fx=FINE, fy=FINE, interpolation=cv2.INTER_CUBIC) for image in images])

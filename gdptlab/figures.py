@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
@@ -158,16 +159,9 @@ def frame_with_particles(
     Figure
     """
     figure, [[axes]] = _panels(1, 6.4, 5.4)
-    axes.imshow(image, **_grey(image))
-    circles = axes.scatter(
-        particles["x_px"], particles["y_px"], c=particles["z_um"], s=330, lw=2.2, marker="o", cmap=DEPTH
-    )
-    circles.set(facecolor="none", clim=z_limits_um)
-    # A scatter that is not filled takes its colours from the map only if told so.
-    circles.set_edgecolor(circles.to_rgba(particles["z_um"]))
-    contrast = "white" if _is_dark(axes) else "black"
-    circles.set_path_effects([withStroke(linewidth=3, foreground=contrast)])
+    circles = _circled(axes, image, particles, z_limits_um)
     if window_px:
+        contrast = "white" if _is_dark(axes) else "black"
         near, (down, across) = window_px // 2, np.array(image.shape) - 1 - window_px // 2
         axes.plot(
             [near, across, across, near, near],
@@ -176,9 +170,24 @@ def frame_with_particles(
             color=contrast,
             lw=1,
         )
-    axes.set(xlabel="x (px)", ylabel="y (px)", title=f"{len(particles)} particles")
     figure.colorbar(circles, label="z (µm)", shrink=0.85)
     return figure
+
+
+def _circled(
+    axes: Axes, image: NDArray, particles: pd.DataFrame, z_limits_um: tuple[float, float], area: float = 330
+) -> PathCollection:
+    """Draw a frame and a circle, coloured by z, round each of its particles."""
+    axes.imshow(image, **_grey(image))
+    circles = axes.scatter(
+        particles["x_px"], particles["y_px"], c=particles["z_um"], s=area, lw=2.2, marker="o", cmap=DEPTH
+    )
+    circles.set(facecolor="none", clim=z_limits_um)
+    # A scatter that is not filled takes its colours from the map only if told so.
+    circles.set_edgecolor(circles.to_rgba(particles["z_um"]))
+    circles.set_path_effects([withStroke(linewidth=3, foreground="white" if _is_dark(axes) else "black")])
+    axes.set(xlabel="x (px)", ylabel="y (px)", title=f"{len(particles)} particles")
+    return circles
 
 
 @_styled

@@ -10,14 +10,18 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from gdptlab.assess import match
 from gdptlab.autocalibrate import ScanCalibration
 from gdptlab.calibration import Calibration
-from gdptlab.figures import COLOURS, DEPTH, MARK, _bare, _depth, _grey, _panels, _similarity, _styled
+from gdptlab.figures import COLOURS, MARK, _bare, _circled, _depth, _grey, _panels, _similarity, _styled
 from gdptlab.quality import depth_quality
 from gdptlab.settings import Settings
+
+NUMBERED = 60
+"""Beads of a scan, the brightest, whose numbers are shown."""
 
 
 @_styled
@@ -33,17 +37,19 @@ def calibration_page(made: ScanCalibration, shown: int = 8) -> Figure:
     Returns
     -------
     Figure
-        The scan where it is sharpest with its beads; images of the average bead; self-similarity; and against z the
-        signal-to-noise ratio, the expected error, the drift, and how much images differ.
+        The scan where it is sharpest with its beads, numbered as in `made.beads`; images of the average bead;
+        self-similarity; and against z the signal-to-noise ratio, the expected error, the drift, and how much images
+        differ.
     """
     calibration, depths = made.calibration, depth_quality(made.calibration, made.noise)
     z_um = calibration.z_um
-    figure = _panels(1, 10, 10.2)[0]
+    figure = _panels(1, 10, 11.6)[0]
     figure.clear()
-    top, strip, bottom = figure.subfigures(3, 1, height_ratios=[4.2, 1.3, 5.2])
-    left, right = top.subplots(1, 2)
+    top, strip, bottom = figure.subfigures(3, 1, height_ratios=[5.6, 1.3, 5.2])
+    left, right = top.subplots(1, 2, width_ratios=[1.5, 1])
     _beads(left, made)
-    figure.colorbar(_similarity(right, calibration.self_similarity(), z_um), ax=right, label="correlation (line: 0.95)")
+    alike = _similarity(right, calibration.self_similarity(), z_um)
+    figure.colorbar(alike, ax=right, label="correlation (line: 0.95)", shrink=0.6)
     right.set_title("Alike: images of two depths")
 
     which = np.rint(np.linspace(0, len(calibration) - 1, shown)).astype(int)
@@ -54,7 +60,8 @@ def calibration_page(made: ScanCalibration, shown: int = 8) -> Figure:
 
     (signal, error), (drift, differ) = bottom.subplots(2, 2, sharex=True)
     signal.semilogy(z_um, depths["signal_to_noise"], color=COLOURS[0])
-    signal.axhline(10, color="0.6", lw=1, ls=":")
+    signal.axhline(10, color="0.6", lw=1, ls=":", label="well above it: good")
+    signal.legend(fontsize="small")
     for k in np.flatnonzero(made.clipped > 0):
         signal.axvspan(z_um[k] - 0.5, z_um[k] + 0.5, color=COLOURS[4], alpha=0.4, lw=0)
     signal.set(
@@ -70,9 +77,13 @@ def calibration_page(made: ScanCalibration, shown: int = 8) -> Figure:
     drift.legend(fontsize="small")
     differ.plot(z_um, 1 - depths["next_alike"], color=COLOURS[0], label="from the next slice")
     differ.plot(z_um, 1 - depths["twin"], ".", color=MARK, label="from the twin, if any")
-    differ.axhline(0.05, color="0.6", lw=1, ls=":")
+    differ.axhline(0.05, color="0.6", lw=1, ls=":", label="mistaken for it")
     differ.set(xlabel="z (µm)", ylabel="1 − correlation", yscale="log", title="Different")
     differ.legend(fontsize="small")
+    for panel in (signal, error, differ):
+        panel.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        panel.yaxis.set_major_formatter("{x:g}")
+        panel.yaxis.set_minor_formatter("{x:g}")
     return figure
 
 
@@ -83,7 +94,7 @@ def _beads(axes: Axes, made: ScanCalibration) -> None:
     marks = zip(
         made.beads["verdict"].value_counts().sort_index(key=lambda v: v != "used").items(),
         ("o", "x", "s", "^", "D"),
-        ("#56B4E9", "#E69F00", "#CC79A7", "white", "white"),
+        ("#56B4E9", "#E69F00", "#CC79A7", "#F0E442", "#009E73"),
         strict=False,
     )
     for (verdict, count), marker, colour in marks:
@@ -101,9 +112,11 @@ def _beads(axes: Axes, made: ScanCalibration) -> None:
             label=f"{verdict} ({count})",
             path_effects=stroke,
         )
+    for bead in made.beads.head(NUMBERED).itertuples():
+        place = {"textcoords": "offset points", "xytext": (6, 6), "fontsize": "small", "color": "white"}
+        axes.annotate(str(bead.Index), (bead.x_px, bead.y_px), **place, path_effects=stroke)
     axes.set(xlabel="x (px)", ylabel="y (px)", title="Beads of the scan, where it is sharpest")
-    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
-    axes.legend(**below, fontsize="small", facecolor="0.4", frameon=True, labelcolor="white")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), fontsize="small", frameon=False)
 
 
 @_styled
@@ -121,21 +134,24 @@ def measured_page(frame: NDArray, table: pd.DataFrame, settings: Settings, calib
     Returns
     -------
     Figure
-        The frame with its particles; how many are found above each C_m, in frames as they are and with their sign
-        turned; and particles from the surest to the least sure, above the images they are taken for.
+        The frame with its particles. Of the correlation, how many are found above each C_m, in frames as they are,
+        in frames with their sign turned, and beside lone particles; of the joint fit, brightness and chi2. And
+        particles from the surest to the least sure, above the images they are taken for.
     """
-    figure = _panels(1, 10, 8)[0]
+    figure = _panels(1, 10, 12.4)[0]
     figure.clear()
-    top, bottom = figure.subfigures(2, 1, height_ratios=[4.4, 3])
-    left, right = top.subplots(1, 2, width_ratios=[1.15, 1])
-    left.imshow(frame, **_grey(frame))
-    limits = {"vmin": calibration.z_um[0], "vmax": calibration.z_um[-1]}
-    dots = left.scatter(
-        table["x_px"], table["y_px"], c=table["z_um"], s=28, cmap=DEPTH, edgecolor="white", lw=0.8, **limits
-    )
-    left.set(xlabel="x (px)", ylabel="y (px)", title=f"{len(table)} particles")
-    figure.colorbar(dots, ax=left, label="z (µm)", shrink=0.85)
-    _cm_histogram(right, settings.found["cm"], settings.false["cm"], settings.threshold)
+    top, middle, bottom = figure.subfigures(3, 1, height_ratios=[6.6, 2.8, 3])
+    whole = top.subplots()
+    limits = calibration.z_um[0], calibration.z_um[-1]
+    circles = _circled(whole, frame, table, limits, area=150)
+    top.colorbar(circles, ax=whole, label="z (µm)", shrink=0.85)
+    left, right = middle.subplots(1, 2)
+    left.hist(table["z_um"], np.linspace(*limits, 21), color=COLOURS[0])
+    left.set(xlabel="z (µm)", ylabel="particles", title="Where they are")
+    if settings.arguments["method"] == "joint":
+        _even(right, table)
+    else:
+        _cm_histogram(right, settings)
 
     pictures = bottom.subplots(2, 8)
     near, (down, across) = calibration.size // 2, np.array(frame.shape) - 1
@@ -156,14 +172,24 @@ def measured_page(frame: NDArray, table: pd.DataFrame, settings: Settings, calib
     return figure
 
 
-def _cm_histogram(axes: Axes, found: pd.Series, false: pd.Series, threshold: float) -> None:
+def _cm_histogram(axes: Axes, settings: Settings) -> None:
     bins = np.arange(0.2, 1.0001, 0.025)
-    axes.hist(found, bins, color=COLOURS[0], alpha=0.8, label="frames as they are")
-    axes.hist(false, bins, histtype="step", color=COLOURS[1], lw=1.8, label="with their sign turned: all false")
-    axes.axvline(threshold, color="black", lw=1.2, ls="--", label=f"threshold {threshold:.2f}")
+    axes.hist(settings.found["cm"], bins, color=COLOURS[0], alpha=0.8, label="frames as they are")
+    none = {"with their sign turned": settings.false, "beside lone particles": settings.ghosts}
+    for (name, finds), colour, line in zip(none.items(), COLOURS[1:], ("-", "--"), strict=False):
+        axes.hist(finds["cm"], bins, histtype="step", color=colour, lw=1.8, ls=line, label=f"{name}: all false")
+    axes.axvline(settings.threshold, color="black", lw=1.2, ls=":", label=f"threshold {settings.threshold:.2f}")
     axes.set(xlabel="$C_m$", ylabel="finds", yscale="symlog", title="Particles, and what is none")
     axes.set_ylim(0, None)
-    axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(0, -0.16))
+    axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(0, -0.2), ncols=2)
+
+
+def _even(axes: Axes, table: pd.DataFrame) -> None:
+    axes.plot(table["brightness"], table["chi2"], "o", color=COLOURS[0], ms=4, mew=0, alpha=0.8)
+    axes.axhline(1, color="0.6", lw=1, ls=":")
+    axes.axvline(table["brightness"].median(), color="0.6", lw=1, ls=":")
+    axes.set(xlabel="brightness (1: the calibration's)", ylabel="chi2", title="As bright as each other, and explained")
+    axes.set_xlim(0, None)
 
 
 @_styled

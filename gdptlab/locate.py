@@ -27,7 +27,7 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from gdptlab.calibration import Calibration
+from gdptlab.calibration import Calibration, checked
 from gdptlab.check import choice, flag, positive, real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.images import Images
@@ -136,18 +136,11 @@ def _checked(
 
 def _image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
     """Image, if it is one that holds at least a template."""
-    size = _size(calibration)
+    size = checked(calibration).size
     image = real_array("image", image, 2)
     if min(image.shape) < size:
         raise ValueError(f"image: got shape {image.shape}, allowed is no smaller than a template, {(size, size)}")
     return image
-
-
-def _size(calibration: Calibration) -> int:
-    """Rows and columns of a template, if that is a calibration."""
-    if not isinstance(calibration, Calibration):
-        raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration")
-    return calibration.size
 
 
 def _table(place: NDArray, step: NDArray, cm: NDArray, calibration: Calibration) -> pd.DataFrame:
@@ -276,6 +269,10 @@ def batch(
         As `locate`: for settings at once, for frames at the first that is refused.
     """
     blank = blank_table(calibration, n_jobs, settings)
+    if getattr(frames, "ndim", 3) == 2:
+        raise ValueError(
+            f"frames: got one of shape {frames.shape}, allowed is a film of them; `locate` measures one frame"
+        )
     try:
         iter(frames)
     except TypeError as error:
@@ -297,7 +294,7 @@ def blank_table(calibration: Calibration, n_jobs: int, settings: dict[str, objec
     """
     if n_jobs != -1:
         whole("n_jobs", n_jobs, 1, 10_000)
-    blank = locate(np.zeros((_size(calibration),) * 2), calibration, **settings)
+    blank = locate(np.zeros((checked(calibration).size,) * 2), calibration, **settings)
     if settings.get("method") == "joint" and n_jobs != 1:
         raise ValueError(f"n_jobs: got {n_jobs}, allowed with method 'joint' is 1: a frame begins with the last")
     return blank.assign(frame=0)[["frame", *blank]]

@@ -94,8 +94,8 @@ class ParticleImages:
         nodes = np.pad(images.astype(np.float64), ((0, 0), (RIM, RIM), (RIM, RIM)))
         for axis in (1, 2):
             nodes = spline_filter1d(nodes, axis=axis)
-        # One image beyond either end, by the parabola through the last three.
-        first, last = (3 * nodes[i] - 3 * nodes[j] + nodes[k] for i, j, k in ((0, 1, 2), (-1, -2, -3)))
+        # One image beyond either end, by the line through the last two.
+        first, last = (2 * nodes[i] - nodes[j] for i, j in ((0, 1), (-1, -2)))
         nodes = spline_filter1d(np.concatenate([first[None], nodes, last[None]]), axis=0)
         self._nodes = np.ascontiguousarray(nodes.reshape(len(nodes), -1), dtype=np.float32)
         self.reach = _reach(images, noise)

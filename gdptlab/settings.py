@@ -3,8 +3,9 @@
 The threshold of C_m: how often does what is certainly no particle reach it? In a frame with its sign turned every
 bright particle is dark, so whatever is found there is false: noise, gaps between particles, rings about them. It is
 as noisy and as crowded as the frame itself, so about as many of its finds lie above any C_m as of the frame's own
-that are false for the same reasons. The threshold is the lowest at which they are few. (What it cannot see are
-particles that are there and come out at a wrong depth.)
+that are false for the same reasons. What it does not show are finds on particles: part of a ring may look like a
+whole one from another depth. Such ghosts are counted on the calibration's own images, each alone on noise. The
+threshold is the lowest at which both kinds are few. (What it cannot see are particles that come out at a wrong depth.)
 """
 
 from collections.abc import Iterable
@@ -15,18 +16,24 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab.calibration import Calibration
+from gdptlab.calibration import Calibration, noise_level
 from gdptlab.check import choice, positive, whole
 from gdptlab.locate import METHODS, locate
 
 LOWEST = 0.2
 """C_m from which on finds are counted."""
 
-EVEN = 0.1
+DEPTHS = 25
+"""Images of the calibration, at most, on which ghosts are counted."""
+
+EVEN = 0.3
 """Largest spread of brightness, its share, with which the joint fit is chosen: it takes particles to be alike."""
 
 EXPLAINED = 1.5
 """Largest median chi2 of particles with which the joint fit is chosen."""
+
+LIKE = 0.5
+"""Smallest median C_m with which it is chosen: a crowd of unlike images, too, can explain anything."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +51,8 @@ class Settings:
     found, false : DataFrame
         What correlation finds in the frames looked at, and in the same with their sign turned, from a C_m of `LOWEST`
         on: the columns of `locate`, and `frame`.
+    ghosts : DataFrame
+        What it finds beside a lone particle at its own place, likewise; `frame` is the image of the calibration.
     """
 
     arguments: dict[str, object]
@@ -51,6 +60,7 @@ class Settings:
     threshold: float
     found: pd.DataFrame
     false: pd.DataFrame
+    ghosts: pd.DataFrame
 
     @property
     def inverted(self) -> bool:
@@ -77,11 +87,12 @@ def choose_settings(
         Of the film to be measured; only some are looked at, from the first on.
     calibration : Calibration
     threshold : float, optional
-        Lowest C_m of a particle, used as it is. If not given, the lowest at which no more than `false_share` as many
-        are found in the frames with their sign turned as in the frames.
+        Lowest C_m of a particle, used as it is. If not given, the lowest at which no more than `false_share` of the
+        finds are false, to judge by the frames with their sign turned and by the ghosts of lone particles.
     method : str, optional
         "correlation" or "joint". If not given, joint where its model holds: where it finds particles alike in
-        brightness (spread at most `EVEN`) and explains what is around them (median chi2 at most `EXPLAINED`).
+        brightness (spread at most `EVEN`) and like the calibration's (median C_m at least `LIKE`) and explains what is
+        around them (median chi2 at most `EXPLAINED`).
     refine : bool, optional
         Of "correlation"; True if not given.
     min_distance_px : float, optional
@@ -126,9 +137,11 @@ def choose_settings(
         )
         for sign in (1, -1)
     )
+    ghosts, alone = _ghosts(calibration, noise_level(looked[0]), others)
     reasons = {"refine": "the whole stack is walked", "min_distance_px": "a quarter of a template"}
     if threshold is None:
-        threshold, reasons["threshold"] = _threshold(found["cm"], false["cm"], false_share)
+        finds = (table["cm"] for table in (found, false, ghosts, alone))
+        threshold, reasons["threshold"] = _threshold(*finds, false_share)
     if method is not None:
         given["method"] = method
     elif given:
@@ -143,19 +156,37 @@ def choose_settings(
         for name, value in arguments.items()
     ]
     table = pd.DataFrame(rows, columns=["setting", "value", "how", "why"]).set_index("setting")
-    return Settings(arguments, table, threshold, found, false)
+    return Settings(arguments, table, threshold, found, false, ghosts)
 
 
 def _above(cm: pd.Series, threshold: float) -> int:
     return int((cm >= threshold).sum())
 
 
-def _threshold(found: pd.Series, false: pd.Series, share: float) -> tuple[float, str]:
+def _ghosts(calibration: Calibration, noise: float, settings: dict[str, object]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """What is found beside, and at, the place of lone particles."""
+    size, rng = calibration.size, np.random.default_rng(0)
+    middle, beside, at = size - 1, [], []
+    for k in np.unique(np.rint(np.linspace(0, len(calibration) - 1, DEPTHS)).astype(int)):
+        frame = rng.normal(0, max(noise, 1e-9), (2 * size - 1, 2 * size - 1))
+        near = slice(middle - size // 2, middle + size // 2 + 1)
+        frame[near, near] += calibration.images[k]
+        finds = locate(frame, calibration, threshold=LOWEST, **settings).assign(frame=k)
+        own = np.hypot(finds["x_px"] - middle, finds["y_px"] - middle) < size / 4
+        at.append(finds[own])
+        beside.append(finds[~own])
+    return pd.concat(beside, ignore_index=True), pd.concat(at, ignore_index=True)
+
+
+def _threshold(
+    found: pd.Series, false: pd.Series, ghosts: pd.Series, alone: pd.Series, share: float
+) -> tuple[float, str]:
     """Lowest threshold with so small a share of false finds, and the reason in words."""
     for threshold in np.arange(LOWEST, 0.99, 0.01).round(2).tolist():
-        n, n_false = _above(found, threshold), _above(false, threshold)
-        if n and n_false <= share * n:
-            return threshold, f"{n} found from there on, {n_false} with the frames' sign turned"
+        n, n_false, n_ghosts, n_alone = (_above(cm, threshold) for cm in (found, false, ghosts, alone))
+        if n and n_false / n + n_ghosts / max(n_ghosts + n_alone, 1) <= share:
+            turned = f"{n} found from there on, {n_false} with the frames' sign turned"
+            return threshold, f"{turned}; {n_ghosts} beside {n_alone} lone particles"
     return 0.5, "nothing is found that is not found with the frames' sign turned, too"
 
 
@@ -166,5 +197,9 @@ def _method(frame: NDArray, calibration: Calibration) -> tuple[str, str]:
         return "correlation", "too few particles to see if they are alike, as joint takes them to be"
     brightness, chi2 = table["brightness"], float(table["chi2"].median())
     spread = float(1.4826 * (brightness - brightness.median()).abs().median() / brightness.median())
-    method = "joint" if spread <= EVEN and chi2 <= EXPLAINED else "correlation"
-    return method, f"particles differ by {100 * spread:.0f} % in brightness, and joint leaves a chi2 of {chi2:.1f}"
+    cm = float(table["cm"].median())
+    method = "joint" if spread <= EVEN and chi2 <= EXPLAINED and cm >= LIKE else "correlation"
+    return method, (
+        f"joint finds {len(table)} particles, as bright as each other to {100 * spread:.0f} %, with a median C_m of "
+        f"{cm:.2f}, and leaves a chi2 of {chi2:.1f}"
+    )

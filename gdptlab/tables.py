@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from gdptlab import check
-from gdptlab.calibration import Calibration
+from gdptlab.calibration import Calibration, checked
 from gdptlab.files import written_whole
 from gdptlab.locate import locate
 from gdptlab.versions import versions
@@ -56,8 +56,7 @@ def fingerprint(calibration: Calibration) -> str:
 
 def about(calibration: Calibration, settings: dict[str, object]) -> dict[str, object]:
     """What a table was made with: hash of the calibration, settings of `locate` and others, versions."""
-    if not isinstance(calibration, Calibration):
-        raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration")
+    checked(calibration)
     unsaid = {name: p.default for name, p in signature(locate).parameters.items() if p.kind is p.KEYWORD_ONLY}
     return {"calibration": fingerprint(calibration), "settings": unsaid | settings, "versions": versions()}
 

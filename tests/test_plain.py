@@ -53,8 +53,11 @@ def test_isolated_particles_as_locate(isolated, calibration, refine):
     frames, true = isolated["fluorescent"]
     result = both(frames[:4], true[true["frame"] < 4], calibration, refine)
     assert (result[["recall", "precision"]] == 1).all(axis=None)
-    relative = np.log(result[SIGMAS]).diff().iloc[1].abs()  # of normal errors, known to 1 / sqrt(2 n) each
-    assert (relative <= CONFIDENCE / np.sqrt(result["n_matched"].min())).all()
+    relative = np.log(result[SIGMAS]).diff().iloc[1]  # of normal errors, known to 1 / sqrt(2 n) each
+    noise = CONFIDENCE / np.sqrt(result["n_matched"].min())
+    assert (relative >= -noise).all()  # locate is no worse
+    # and no better in x and y; in z its least squares beat the parabola through three C_m
+    assert (relative[SIGMAS[:2]] <= noise).all() and relative[SIGMAS[2]] <= noise + (0.2 if refine else 0)
 
 
 @pytest.mark.parametrize("refine", [True, False])
