@@ -269,11 +269,11 @@ def _bead_of(places: NDArray) -> NDArray[np.int64]:
     """
     pairs = KDTree(places).query_pairs(MOST_APART, output_type="ndarray")
     steps = places[pairs[:, 1]] - places[pairs[:, 0]]
-    back = (steps[:, 0] < 0) | ((steps[:, 0] == 0) & (steps[:, 1] < 0))
-    steps[back] *= -1
     by_chance = 2 * len(steps) * (SAME / MOST_APART) ** 2
     joined = np.zeros(len(pairs), dtype=bool)
-    for same in KDTree(steps).query_ball_point(steps, SAME) if len(steps) else ():
+    either_way = KDTree(np.concatenate([steps, -steps])) if len(steps) else None
+    for step in steps:
+        same = np.unique(np.array(either_way.query_ball_point(step, SAME)) % len(steps))
         spots = np.unique(pairs[same])
         if len(same) >= max(3, len(places) / 5, 10 * by_chance) and len(spots) > 1.8 * len(same):
             joined[same] = True

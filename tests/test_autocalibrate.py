@@ -1,5 +1,7 @@
 """A calibration made from a scan by itself: which beads, how large, and what is said of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -151,3 +153,34 @@ def test_a_frame_of_the_scan_is_measured_where_it_was_taken(scan, made) -> None:
     table = locate(scan[7], made.calibration, threshold=0.5)
     true = pd.DataFrame({"x_px": PLACES[:4, 0], "y_px": PLACES[:4, 1], "z_um": Z_UM[7]})
     assert assess.scores(table, true).sigma_z_um < 1 and assess.scores(table, true).recall == 1
+
+
+def lobed_scan(places, z_um):
+    """Beads that are two spots, 18 px apart, wherever they are in focus, and one blur elsewhere."""
+    y, x = np.indices((240, 320))
+    scan = []
+    for z in z_um:
+        width = 2 + abs(z) / 5
+        spots = [np.exp(-((x - a) ** 2 + (y - b - s) ** 2) / (2 * width**2)) for a, b in places for s in (-9, 9)]
+        scan.append(2000 / width**2 * np.sum(spots, axis=0))
+    return np.array(scan) + np.random.default_rng(4).normal(0, 4, (len(z_um), *y.shape))
+
+
+def test_spots_of_one_bead_are_one_bead() -> None:
+    z_um, places = np.linspace(-30, 30, 21), np.array([[50, 60], [160, 55], [270, 70], [60, 180], [200, 185.0]])
+    found = find_beads(lobed_scan(places, z_um), z_um)
+    assert len(found) == 5
+    assert KDTree(found[["x_px", "y_px"]]).query(places)[0].max() < 1
+    assert found["brightness"].between(0.5, 1.1 * found["brightness"].max()).all() and found["brightness"].min() > 200
+
+
+def test_beads_in_a_regular_array_stay_apart() -> None:
+    grid = np.stack(np.meshgrid(np.arange(30, 330, 50), np.arange(30, 220, 50)), axis=-1).reshape(-1, 2)
+    assert len(find_beads(scan_of(grid), Z_UM)) == len(grid)
+
+
+def test_leaps_of_a_bead_are_told_from_drift(made) -> None:
+    steady = report(made).loc["drift"]
+    leap = replace(made, drift_px=np.where(np.arange(26)[:, None] < 13, 0.0, [9.0, 0.0]))
+    assert steady["verdict"] == "good"
+    assert report(leap).loc["drift", "verdict"] == "bad" and "beads_px" in report(leap).loc["drift", "advice"]

@@ -598,3 +598,41 @@ def test_plans_stay_behind_when_a_calibration_is_sent(stacks):
     assert "own_error" in sent.__dict__  # what is made only once goes with it
     np.testing.assert_array_equal(sent.templates, made.templates)
     assert sent.plan(Planned, (70, 80)).calibration is sent
+
+
+@pytest.mark.parametrize("away", [(-9, 0), (6, 8), (0, 0)])
+def test_a_rough_place_will_do(scan, away) -> None:
+    """The particle is looked for about it, and the template no larger for it."""
+    x, y = 67 + away[0], 51 + away[1]
+    exact = Calibration.from_scan(scan[1], SCAN_Z_UM, 67, 51, size=61)
+    rough = Calibration.from_scan(scan[1], SCAN_Z_UM, x, y, size=61)
+    assert np.einsum("kij,kij->k", exact.templates, rough.templates).min() > 0.97
+
+
+def test_an_empty_place_is_refused() -> None:
+    noise = np.random.default_rng(2).normal(400, 20, (15, 90, 90))
+    with pytest.raises(ValueError, match=r"x_px, y_px: got a particle at .* nothing stands out by more than"):
+        Calibration.from_scan(noise, np.arange(15.0), 44, 45, size=41)
+    noise[:, 20:24, 20:24] += 600  # in a corner of the template
+    with pytest.raises(ValueError, match="beside it, by"):
+        Calibration.from_scan(noise, np.arange(15.0), 40, 40, size=41)
+
+
+def test_a_particle_cut_by_the_border_is_refused(microscope) -> None:
+    particle = table([19.0], [60.0], [0.0])
+    frames = np.array([microscope.render(particle.assign(z_um=z), (120, 120), rng=3) for z in SCAN_Z_UM])
+    with pytest.raises(ValueError, match="whose images reach the border"):
+        Calibration.from_scan(frames, SCAN_Z_UM, 19, 60)
+
+
+def test_a_calibration_says_what_it_is(calibration) -> None:
+    assert repr(calibration).startswith("<Calibration: 51 images of 61 by 61 px, z = -50 to 50 µm, 9 in the subset")
+
+
+def test_denoised_images_are_nearer_to_the_truth_in_every_part(clean_stack, stacks) -> None:
+    """Of a particle that is its own mirror image, what is not symmetric is noise, and goes."""
+    smooth = denoised(stacks["fluorescent"])
+    odd = (smooth - smooth[:, :, ::-1]) / 2
+    noise = noise_level(stacks["fluorescent"])
+    assert np.sqrt((odd**2).mean()) < 0.03 * noise
+    assert np.sqrt(((smooth - clean_stack + clean_stack.mean() - smooth.mean()) ** 2).mean()) < 0.3 * noise

@@ -424,6 +424,11 @@ def test_batch_of_what_is_no_film(calibration, frames):
         batch(frames, calibration, progress=False)
 
 
+def test_batch_of_a_frame_says_what_measures_one(calibration):
+    with pytest.raises(ValueError, match=r"^frames: got one of shape \(80, 90\), .* `locate` measures one"):
+        batch(np.zeros((80, 90)), calibration)
+
+
 def test_batch_passes_settings_on(few, calibration):
     measured = batch([few[0]], calibration, progress=False, refine=False, threshold=0.9)
     pd.testing.assert_frame_equal(
@@ -472,6 +477,7 @@ def with_value(value):
     [
         (np.zeros(90), ValueError, r"^image: got shape \(90,\), allowed are 2 axes, none of them empty"),
         (np.zeros((80, 90, 3)), ValueError, r"^image: got shape \(80, 90, 3\)"),
+        (np.zeros((5, 80, 90)), ValueError, r"^image: got shape \(5, 80, 90\), .* take one image, as in image\[0\]"),
         (np.zeros((0, 90)), ValueError, r"^image: got shape \(0, 90\)"),
         (np.zeros((60, 90)), ValueError, r"^image: got shape \(60, 90\), allowed is no smaller than a template, \(61"),
         (np.zeros((90, 60)), ValueError, r"^image: got shape \(90, 60\)"),

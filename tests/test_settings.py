@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab import assess, batch, locate
+from gdptlab import Calibration, assess, batch, locate
 from gdptlab.settings import choose_settings
 
 
@@ -68,3 +68,19 @@ def test_blank_frames_have_no_particles(calibration) -> None:
 def test_refuses(calibration, changes, error, message) -> None:
     with pytest.raises(error, match=message):
         choose_settings(**{"frames": np.zeros((1, 80, 80)), "calibration": calibration} | changes)
+
+
+def test_parts_of_a_particle_are_no_particles() -> None:
+    """In focus a particle is a spot, far from it four of them: what looks like a particle in each is a ghost."""
+    z_um, (y, x) = np.arange(12.0), np.indices((41, 41)) - 20
+    reach = np.repeat([0, 8], 6)
+    stack = np.array(
+        [sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 8) for a in (-r, r) for b in (-r, r)) / 4 for r in reach]
+    )
+    calibration = Calibration.from_stack(1000 * stack + np.random.default_rng(1).normal(0, 2, stack.shape), z_um)
+    frame = np.random.default_rng(2).normal(0, 2, (200, 200))
+    for row, column, k in ((50, 50, 2), (140, 60, 9), (60, 150, 10), (140, 140, 3)):
+        frame[row - 20 : row + 21, column - 20 : column + 21] += 1000 * stack[k]
+    settings = choose_settings([frame], calibration, method="correlation")
+    assert len(settings.ghosts) >= 4 and settings.threshold > settings.ghosts["cm"].max()
+    assert len(locate(frame, calibration, **settings.arguments)) == 4
