@@ -333,7 +333,7 @@ def _fitting(stack: NDArray, scan: NDArray, z_um: NDArray, beads: pd.DataFrame) 
 
     A smaller template leaves out what is faint, but also the neighbours.
     """
-    n, within_um = stack.shape[1], (z_um[-1] - z_um[0]) / 20
+    n, within_um = stack.shape[1], (z_um[-1] - z_um[0]) / 50
     looked = np.rint(np.linspace(0, len(scan) - 1, CHECKED + 2)[1:-1]).astype(int)
     true = pd.concat([beads[["x_px", "y_px"]].assign(frame=k, z_um=z_um[k]) for k in looked], ignore_index=True)
     best, most = stack, 0.0

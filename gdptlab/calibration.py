@@ -582,7 +582,7 @@ def _centred(
     return np.stack(stack)[:, margin:-margin, margin:-margin], centres
 
 
-def _image_size(cut: NDArray, faint: float = 0.08) -> int:
+def _image_size(cut: NDArray, faint: float = 0.06) -> int:
     """Smallest odd size that holds the particle in nearly every slice of (N, 2 r + 1, 2 r + 1).
 
     An image ends where the median over a ring about the centre, which a neighbour does not move, first falls

@@ -26,7 +26,7 @@ LOWEST = 0.2
 DEPTHS = 25
 """Images of the calibration, at most, on which ghosts are counted."""
 
-EVEN = 0.3
+EVEN = 0.2
 """Largest spread of brightness, its share, with which the joint fit is chosen: it takes particles to be alike."""
 
 EXPLAINED = 1.5
@@ -196,7 +196,8 @@ def _method(frame: NDArray, calibration: Calibration) -> tuple[str, str]:
     if len(table) < 5:
         return "correlation", "too few particles to see if they are alike, as joint takes them to be"
     brightness, chi2 = table["brightness"], float(table["chi2"].median())
-    spread = float(1.4826 * (brightness - brightness.median()).abs().median() / brightness.median())
+    # Of normal numbers, the standard deviation; of a few far brighter ones it takes notice.
+    spread = float((brightness.quantile(0.9) - brightness.quantile(0.1)) / (2.563 * brightness.median()))
     cm = float(table["cm"].median())
     method = "joint" if spread <= EVEN and chi2 <= EXPLAINED and cm >= LIKE else "correlation"
     return method, (

@@ -26,7 +26,7 @@ def test_joint_is_chosen_for_particles_that_are_alike(few, calibration, microsco
     frame, particles = few
     rng = np.random.default_rng(8)
     more = pd.concat([particles, particles.assign(x_px=particles["x_px"] - 16, z_um=-particles["z_um"])])
-    crowd = [microscope.render(more.assign(brightness=b), frame.shape, rng=rng) for b in (1.0, np.arange(1, 9) / 4)]
+    crowd = [microscope.render(more.assign(brightness=b), frame.shape, rng=rng) for b in (1.0, np.geomspace(0.2, 5, 8))]
     methods = [choose_settings([image], calibration).arguments["method"] for image in crowd]
     assert methods == ["joint", "correlation"]
     assert choose_settings([frame], calibration).arguments["method"] == "correlation"  # too few to tell
