@@ -48,7 +48,7 @@ def peaks(
 def strongest(place: NDArray[np.float64], cm: NDArray, distance_px: float) -> NDArray[np.int64]:
     """Indices by falling C_m (n,), without those nearer than this to a stronger one, or with none; of places (n, 2)."""
     order = np.argsort(-cm, kind="stable")
-    return _apart(place, order[cm[order] > 0], distance_px**2)
+    return _apart(place, order[cm[order] > 0], min(distance_px, 1e150) ** 2)  # of more, the square is no number
 
 
 @compiled

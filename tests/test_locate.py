@@ -698,3 +698,8 @@ def test_joint_batch_begins_each_frame_with_the_last(few, stacks, calibration):
     pd.testing.assert_frame_equal(one, two, check_exact=True)
     with pytest.raises(ValueError, match=r"^n_jobs: got 2, allowed with method 'joint' is 1"):
         batch(frames, calibration, n_jobs=2, method="joint")
+
+
+def test_a_distance_beyond_all_leaves_the_best(few, calibration):
+    table = locate(few[0], calibration, min_distance_px=1e300)
+    assert len(table) == 1 and table["cm"][0] == locate(few[0], calibration)["cm"].max()
