@@ -200,14 +200,18 @@ def calibrate(
         ],
         columns=["setting", "value", "how", "why"],
     ).set_index("setting")
-    noise = noise_level(scan[:: max(len(scan) // 5, 1)])
+    noise = max(noise_level(scan[:: max(len(scan) // 5, 1)]), 1e-9)
     return ScanCalibration(calibration, beads, drift, clipped, settings, overview, noise)
 
 
 def _checked(scan: ArrayLike, z_um: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
     """Scan, as it is recorded, and depths, both in the order of increasing depth."""
-    scan, z_um = np.asarray(scan), _depths(z_um)
-    real_array("scan", scan[:1], 3)
+    try:
+        scan = np.asarray(scan)
+    except ValueError as error:
+        raise ValueError(f"scan: got what is no array ({error}), allowed are 3 axes of real numbers") from error
+    z_um = _depths(z_um)
+    real_array("scan", scan[:1] if scan.ndim else scan, 3)
     if len(scan) < LEAST or len(z_um) != len(scan):
         raise ValueError(
             f"scan, z_um: got {len(scan)} frames and {len(z_um)} depths, needed are as many, {LEAST} or more"

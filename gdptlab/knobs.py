@@ -38,6 +38,7 @@ class Knobs:
 
     def __init__(self, frame: ArrayLike, calibration: Calibration) -> None:
         self._frame, self._calibration = real_array("frame", frame, 2), calibration
+        self._found: dict[tuple, tuple[pd.DataFrame, float]] = {}
         self.table = pd.DataFrame()
         with plt.rc_context(STYLE):
             self._figure = Figure(figsize=(10, 4.6), dpi=80)
@@ -63,13 +64,8 @@ class Knobs:
 
     def __call__(self, threshold: float, n_sub: int, refine: bool, method: str) -> NDArray[np.uint8]:
         """Picture (rows, columns, 3), red, green and blue, of what `locate` finds with these settings."""
-        calibration = self._calibration
-        if n_sub != len(calibration.subset):
-            calibration = self._calibration = calibration.with_subset(n_sub)
-        settings = {"threshold": threshold, "refine": refine} if method == "correlation" else {}
-        start = perf_counter()
-        self.table = table = locate(self._frame, calibration, method=method, **settings)
-        took = 1000 * (perf_counter() - start)
+        self.table, took = self.found(threshold, n_sub, refine, method)
+        table = self.table
         self._dots.set_offsets(table[["x_px", "y_px"]])
         self._dots.set_edgecolor(self._dots.to_rgba(table["z_um"]))
         counts = np.histogram(table["cm"], BINS)[0]
@@ -79,6 +75,18 @@ class Knobs:
         self._title.set_text(f"{len(table)} particles, {took:.0f} ms")
         self._draw(max(counts.max(), 1))
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def found(self, threshold: float, n_sub: int, refine: bool, method: str) -> tuple[pd.DataFrame, float]:
+        """What `locate` finds, and how long it took (ms). Kept, so that to and fro costs nothing."""
+        turned = (threshold, n_sub, refine) if method == "correlation" else ()
+        if turned not in self._found:
+            if n_sub != len(self._calibration.subset):
+                self._calibration = self._calibration.with_subset(n_sub)
+            settings = {"threshold": threshold, "refine": refine} if turned else {}
+            start = perf_counter()
+            table = locate(self._frame, self._calibration, method=method, **settings)
+            self._found[turned] = table, 1000 * (perf_counter() - start)
+        return self._found[turned]
 
     def _draw(self, highest: int) -> None:
         """Draw what moves upon what does not, which is drawn anew only if bars outgrow their axes, or shrink a lot."""
@@ -137,5 +145,6 @@ def panel(frame: ArrayLike, calibration: Calibration, *, threshold: float = 0.5)
     for control in controls.values():
         control.observe(turn, "value")
     turn()
+    knobs.found(threshold, n_sub, True, "joint")  # the slowest, so that it is there when it is asked for
     rows = [ipywidgets.HBox(list(controls.values())[:2]), ipywidgets.HBox(list(controls.values())[2:]), picture]
     return ipywidgets.VBox(rows)

@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from gdptlab.calibration import Calibration, noise_level
-from gdptlab.check import choice, positive, whole
+from gdptlab.check import choice, positive, real_array, whole
 from gdptlab.locate import METHODS, locate
 
 LOWEST = 0.2
@@ -122,15 +122,20 @@ def choose_settings(
     given = {name: value for name, value in given.items() if value is not None}
     if method == "joint" and given:
         raise ValueError(f"{', '.join(given)}: got one with method 'joint', which has none of them")
-    looked = [np.asarray(frame) for frame in islice(frames, whole("looked_at", looked_at, 1, 10_000))]
+    whole("looked_at", looked_at, 1, 10_000)
+    try:
+        looked = [real_array("image", frame, 2) for frame in islice(frames, looked_at)]
+    except TypeError as error:
+        if str(error).startswith("image"):
+            raise
+        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
     if not looked:
         raise ValueError("frames: got none, needed is one or more")
     others = {name: value for name, value in given.items() if name != "threshold"}
-    # As floats: an unsigned 3 with its sign turned is 65533.
     found, false = (
         pd.concat(
             [
-                locate(sign * frame.astype(float), calibration, threshold=LOWEST, **others).assign(frame=i)
+                locate(sign * frame, calibration, threshold=LOWEST, **others).assign(frame=i)
                 for i, frame in enumerate(looked)
             ],
             ignore_index=True,

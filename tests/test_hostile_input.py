@@ -17,8 +17,11 @@ from hypothesis import strategies as st
 
 from gdptlab import Calibration, batch, locate, match
 from gdptlab.assess import scores, scores_by_z
+from gdptlab.autocalibrate import calibrate
 from gdptlab.datasets import DATA
 from gdptlab.images import open_images, open_scan
+from gdptlab.quality import report
+from gdptlab.settings import choose_settings
 from gdptlab.stream import batch_to_parquet
 from gdptlab.tables import in_um, save_points, save_table
 
@@ -94,7 +97,7 @@ def placed(array, layout):
         array.flags.writeable = False
     elif layout == "Fortran":
         array = np.asfortranarray(array)
-    elif layout == "backwards":
+    elif layout == "backwards" and array.ndim:
         turn = (slice(None, None, -1),) * array.ndim
         array = array[turn].copy()[turn]
     elif layout == "strided" and array.ndim:
@@ -218,6 +221,30 @@ def test_from_scan(scan, z_um, x_px, y_px, given):
     made = fails_by_name(lambda: Calibration.from_scan(scan, z_um, x_px, y_px, **given), *names)
     if made is not None:
         assert_sound_calibration(made)
+
+
+@tried
+@given(
+    scan=arrays(dims=st.sampled_from([3, 3, 3, 2]), side=st.sampled_from([7, 9, 25, 40])) | odd,
+    z_um=depths,
+    given=some("beads_px", "size", "n_sub"),
+)
+def test_calibrate(scan, z_um, given):
+    fit = isinstance(scan, np.ndarray) and scan.ndim == 3
+    z_um = np.arange(len(scan)) if fit and isinstance(z_um, np.ndarray) else z_um
+    made = fails_by_name(lambda: calibrate(scan, z_um, **given), "scan", "stack", "z_um", "beads_px", "size", "n_sub")
+    if made is not None:
+        assert_sound_calibration(made.calibration)
+        assert np.isfinite(made.drift_px).all() and len(report(made)) == 9
+
+
+@tried
+@given(frames=st.lists(some_images, max_size=2) | odd, given=some("threshold", "method", "refine", "min_distance_px"))
+def test_choose_settings(frames, given):
+    names = ("frames", "image", "threshold", "method", "refine", "min_distance_px")
+    chosen = fails_by_name(lambda: choose_settings(frames, CALIBRATION, **given), *names)
+    if chosen is not None:
+        assert 0 < chosen.threshold <= 1 and np.isfinite(chosen.ghosts.astype(float)).all(axis=None)
 
 
 # -------------------- tables
