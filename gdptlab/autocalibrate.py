@@ -189,13 +189,20 @@ def calibrate(
     how = {False: "by itself", True: "given"}
     settings = pd.DataFrame(
         [
-            ("beads", f"{used} of {len(beads)}", how[beads_px is not None], "alone, not clipped and alike; averaged"),
+            (
+                "beads",
+                f"{used} of {len(beads)}",
+                how[beads_px is not None],
+                "averaged, whatever they are like"
+                if beads_px is not None
+                else "alone, not clipped and alike; averaged",
+            ),
             ("size", f"{calibration.size} px", how[size is not None], _reason(chosen, calibration.size)),
             (
                 "n_sub",
                 f"{len(calibration.subset)} of {len(calibration)}",
                 how[n_sub is not None],
-                f"each depth is alike to {COVERED} to one of them, if so many can do it",
+                f"enough for each depth to be like one of them (C_m {COVERED}), or the most that is tried",
             ),
         ],
         columns=["setting", "value", "how", "why"],
@@ -335,17 +342,19 @@ def _size(scan: NDArray, beads: pd.DataFrame) -> int:
 def _fitting(stack: NDArray, scan: NDArray, z_um: NDArray, beads: pd.DataFrame) -> NDArray[np.float32]:
     """The stack, cut smaller if more of the scan's beads are then found at their depth.
 
-    A smaller template leaves out what is faint, but also the neighbours.
+    A smaller template leaves out what is faint, but also the neighbours. The joint fit has no such need, and is
+    tried with the whole images first.
     """
     n, within_um = stack.shape[1], (z_um[-1] - z_um[0]) / 50
     looked = np.rint(np.linspace(0, len(scan) - 1, CHECKED + 2)[1:-1]).astype(int)
     true = pd.concat([beads[["x_px", "y_px"]].assign(frame=k, z_um=z_um[k]) for k in looked], ignore_index=True)
     best, most = stack, 0.0
-    for share in SHARES:
+    for share, method in ((1.0, "joint"), *((share, "correlation") for share in SHARES)):
         m = round(n * (1 - share) / 2)
         cut = stack[:, m : n - m, m : n - m]
         calibration = Calibration.from_stack(cut, z_um, n_sub=min(9, len(scan)))
-        found = pd.concat([locate(scan[k], calibration).assign(frame=k) for k in looked], ignore_index=True)
+        found = [locate(scan[k], calibration, method=method).assign(frame=k) for k in looked]
+        found = pd.concat(found, ignore_index=True)
         right = len(match(found, true, within_px=max(2, n / 10), within_um=within_um))
         if right > 1.05 * most:  # not for one bead more or less
             best, most = cut, right
@@ -355,14 +364,19 @@ def _fitting(stack: NDArray, scan: NDArray, z_um: NDArray, beads: pd.DataFrame) 
 def _reason(widest: int, size: int) -> str:
     if size == widest:
         return "just holds the widest image of a bead"
-    return f"the widest image has {widest} px, but so more of the scan's beads are found at their depth"
+    return f"the widest image has {widest} px, but with this more of the scan's beads are found at their depth"
 
 
 def _averaged(
     scan: NDArray, z_um: NDArray, beads: pd.DataFrame, size: int, *, given: bool
 ) -> tuple[pd.DataFrame, NDArray, NDArray, NDArray]:
     """Beads with a verdict each, their average stack, its drift (N, 2), and the share clipped in each slice."""
-    beads = beads.assign(clipped=np.nan, alike=np.nan, offset_um=np.nan, verdict="too near to another or the border")
+    beads = beads.assign(
+        clipped=np.nan,
+        alike=np.nan,
+        offset_um=np.nan,
+        verdict=f"too near to another or the border: not {size} px of room",
+    )
     end = np.array(scan.shape[:0:-1]) - 1
     places = beads[["x_px", "y_px"]].to_numpy()
     inside = 2 * np.minimum(places, end - places).min(axis=1)

@@ -603,9 +603,9 @@ def _image_size(cut: NDArray, faint: float = 0.06) -> int:
 
 def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) -> NDArray[np.float64]:
     """Centre (x, y) of the particle in every slice, (N, 2), px."""
-    cut = _cut(scan, x_px, y_px, size // 2)
-    cut = cut - np.median(cut, axis=(1, 2), keepdims=True)
-    weight = np.einsum("kij,kij->k", cut, cut)
+    cut = levelled(_cut(scan, x_px, y_px, size // 2).astype(np.float32))
+    smooth = denoised(cut)
+    weight = np.einsum("kij,kij->k", smooth, smooth)  # of the particle's light, not of the noise
     if not weight.all():
         blank = np.flatnonzero(weight == 0).tolist()
         raise ValueError(f"scan: got frames without contrast around x_px, y_px at {blank}, allowed are frames with it")
