@@ -197,7 +197,12 @@ def calibrate(
                 if beads_px is not None
                 else "alone, not clipped and alike; averaged",
             ),
-            ("size", f"{calibration.size} px", how[size is not None], _reason(chosen, calibration.size)),
+            (
+                "size",
+                f"{calibration.size} px",
+                how[size is not None],
+                "" if size else _reason(chosen, calibration.size),
+            ),
             (
                 "n_sub",
                 f"{len(calibration.subset)} of {len(calibration)}",

@@ -204,10 +204,10 @@ class Calibration:
             if not 3 <= size <= 2 * room + 1 or size % 2 == 0:
                 raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {2 * room + 1} for {where}")
             stack, centres = _centred(scan, z_um, x_px, y_px, size, room)
-            away = centres.mean(axis=0) - (x_px, y_px)
-            if np.abs(away).max() <= 1:
+            middle = centres.mean(axis=0)
+            if np.abs(middle - (x_px, y_px)).max() <= 1:
                 break
-            x_px, y_px = np.clip(centres.mean(axis=0), 0, (columns - 1, rows - 1)).tolist()
+            x_px, y_px = np.clip(middle, 0, (columns - 1, rows - 1)).tolist()
         calibration = cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
         calibration._must_stand_out(where)
         return calibration
@@ -217,7 +217,7 @@ class Calibration:
         noise, edge = max(noise_level(self.stack), 1e-9), self.size // 4
         smooth = denoised(self.stack)
         height = np.abs(smooth - np.median(smooth, axis=(1, 2), keepdims=True)).max(axis=0) / noise
-        inside = height[edge:-edge, edge:-edge].max()
+        inside = height[edge : self.size - edge, edge : self.size - edge].max()
         if inside < max(STANDS_OUT, height.max() / 2):
             raise ValueError(
                 f"x_px, y_px: got {where}, where nothing stands out by more than {inside:.1f} times the noise (beside "

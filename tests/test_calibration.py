@@ -618,6 +618,10 @@ def test_an_empty_place_is_refused() -> None:
         Calibration.from_scan(noise, np.arange(15.0), 40, 40, size=41)
 
 
+def test_the_smallest_template(scan):
+    assert Calibration.from_scan(scan[1], SCAN_Z_UM, 68, 50, size=3).size == 3
+
+
 def test_a_particle_cut_by_the_border_is_refused(microscope) -> None:
     particle = table([19.0], [60.0], [0.0])
     frames = np.array([microscope.render(particle.assign(z_um=z), (120, 120), rng=3) for z in SCAN_Z_UM])
