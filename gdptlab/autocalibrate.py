@@ -26,13 +26,12 @@ from gdptlab.calibration import (
     _centred,
     _depths,
     _image_size,
-    denoised,
     levelled,
-    noise_level,
 )
 from gdptlab.check import real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.correlation import normalised
+from gdptlab.denoising import denoised, noise_level
 from gdptlab.locate import locate
 
 STANDS_OUT = 8.0

@@ -17,15 +17,15 @@ import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
-from scipy.fft import dctn, idctn
 from scipy.interpolate import make_smoothing_spline
-from scipy.ndimage import gaussian_filter, median, uniform_filter1d
+from scipy.ndimage import median, uniform_filter1d
 from scipy.ndimage import shift as shift_image
 from skimage.registration import phase_cross_correlation
 
 from gdptlab.check import flag, positive, real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.correlation import Correlator, normalised
+from gdptlab.denoising import denoised, noise_level
 from gdptlab.displacement import Displacement
 from gdptlab.files import written_whole
 
@@ -36,12 +36,6 @@ VERSION = 1
 
 LARGEST = 121
 """Rows and columns, px, beyond which no size is chosen for a template unasked."""
-
-WINDOW = 11
-"""Images that are filtered together."""
-
-SMOOTHED = (0.7, 1.5, 1.5)
-"""Frequencies along z and in the image (every other one) over which the power of a window's spectrum is smoothed."""
 
 REPEATS = 4
 """Of making the calibration again, to see what noise does to it."""
@@ -267,6 +261,8 @@ class Calibration:
         """
         flat = self.templates.reshape(len(self), -1)
         strength = np.einsum("kp,kp->k", levelled(self.stack).reshape(len(self), -1), flat)
+        if len(self) >= 5:
+            strength = make_smoothing_spline(self.z_um, strength.astype(float))(self.z_um).astype(np.float32)
         smooth = strength[:, None, None] * self.templates
         tilt = self.stack - levelled(self.stack)
         if len(self) >= 5:
@@ -481,42 +477,6 @@ def _depths(z_um: ArrayLike) -> NDArray[np.float64]:
     return z_um
 
 
-def denoised(stack: NDArray) -> NDArray[np.float32]:
-    """Smooth model of a stack: a Wiener filter along z and in the image, in windows along z.
-
-    From window to window it follows how bright and how sharp the images are. Even and odd frequencies of the
-    cosine transform are the symmetric and the antisymmetric part of an image and are filtered each for itself:
-    a particle that is its own mirror image has nothing in three of the four parts, and three quarters of the noise
-    go with them.
-
-    Parameters
-    ----------
-    stack : array (N, n, n)
-
-    Returns
-    -------
-    float32 array (N, n, n)
-    """
-    noise, count = noise_level(stack), min(WINDOW, len(stack))
-    middle = np.abs(np.arange(count) - (count - 1) / 2)
-    trust = (1 - middle / ((count + 1) / 2)).astype(np.float32)[:, None, None] ** 2
-    # Polynomials, not cosines, as images still change at the ends of a window.
-    along_z = np.linalg.qr(np.vander(np.linspace(-1, 1, count), increasing=True))[0].astype(np.float32)
-    levels = stack.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
-    spectra = dctn((stack - levels).astype(np.float32), axes=(1, 2), norm="ortho")
-    smooth, weight = np.zeros_like(spectra), np.zeros((len(stack), 1, 1), dtype=np.float32)
-    for k in range(len(stack) - count + 1):
-        window = np.einsum("zp,zij->pij", along_z, spectra[k : k + count])
-        for part in (window[:, i::2, j::2] for i in (0, 1) for j in (0, 1)):
-            # The power is the signal's own, smoothed. As that still scatters, half as much noise again is taken
-            # from it, so that of noise alone next to nothing is left.
-            power = gaussian_filter(part**2, SMOOTHED, mode="nearest")
-            part *= 1 - np.minimum(1.5 * noise**2 / np.where(power > 0, power, 1), 1)
-        smooth[k : k + count] += trust * np.einsum("zp,pij->zij", along_z, window)
-        weight[k : k + count] += trust
-    return (idctn(smooth / weight, axes=(1, 2), norm="ortho") + levels).astype(np.float32)
-
-
 def levelled(images: NDArray) -> NDArray:
     """Subtract from each image the plane that fits it best.
 
@@ -536,22 +496,6 @@ def levelled(images: NDArray) -> NDArray:
     unit = ramp / (n * (ramp**2).sum())
     down, across = (np.einsum(f"...ij,{axis}->...", images, unit)[..., None, None] for axis in "ij")
     return images - images.mean(axis=(-2, -1), keepdims=True) - down * ramp[:, None] - across * ramp
-
-
-def noise_level(images: NDArray) -> float:
-    """Standard deviation of the noise of a pixel, from differences that smooth structure does not reach.
-
-    Parameters
-    ----------
-    images : array (..., rows, columns)
-
-    Returns
-    -------
-    float
-        From the median size of mixed second differences, which few sharp edges do not move.
-    """
-    mixed = np.diff(np.diff(np.asarray(images, dtype=np.float64), axis=-1), axis=-2)
-    return float(np.median(np.abs(mixed)) / (2 * 0.6745))
 
 
 def _even_centre(images: NDArray) -> NDArray:

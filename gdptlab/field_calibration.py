@@ -20,9 +20,10 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial import KDTree
 
 from gdptlab.background import Background
-from gdptlab.calibration import Calibration, _depths, checked, noise_level
+from gdptlab.calibration import Calibration, _depths, checked
 from gdptlab.check import real_array, whole
 from gdptlab.cores import on_one_core
+from gdptlab.denoising import noise_level
 from gdptlab.field_images import FINE, FieldImages, field_terms
 from gdptlab.particle_images import Columns
 

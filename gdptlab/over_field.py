@@ -16,9 +16,9 @@ from scipy.optimize import nnls
 from scipy.spatial import KDTree
 
 from gdptlab.background import Background
-from gdptlab.calibration import noise_level
 from gdptlab.check import real_array
 from gdptlab.cores import compiled, on_one_core
+from gdptlab.denoising import noise_level
 from gdptlab.field_calibration import MISFIT, PHOTONS, FieldCalibration
 from gdptlab.field_images import FINE, field_terms
 from gdptlab.joint_fit import JointFit, fitted

@@ -14,10 +14,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.optimize import nnls
 
 from gdptlab.background import Background
-from gdptlab.calibration import Calibration, noise_level
+from gdptlab.calibration import Calibration
 from gdptlab.cores import compiled
+from gdptlab.denoising import noise_level
 from gdptlab.joint_fit import JointFit, fitted
 from gdptlab.matched_filter import MatchedFilter
 from gdptlab.particle_images import ParticleImages
@@ -79,8 +82,8 @@ class Explained:
         Of y, x and step, per frame.
     brightness, spread : float
         Mean and standard deviation of the particles'.
-    variance : float64 array (3,)
-        Polynomial, highest power first, of a pixel's variance in the light of the particles.
+    variance : float64 array (2,)
+        Slope and level of a pixel's variance in the light of the particles.
     """
 
     fit: JointFit
@@ -117,7 +120,7 @@ class Overlap:
         noise = noise if noise > 1e-15 else 1.0  # a blank frame has none, or one whose square is lost in float32
         places, brightness = self._search(self._reduced(frame), noise)
         places[:, :2] *= self._scale
-        spread, variance, behind = KNOWN * brightness, np.array([0, 0, noise**2]), None
+        spread, variance, behind = KNOWN * brightness, np.array([0, noise**2]), None
         weight = np.full(frame.shape, noise**-2, dtype=np.float32)
         for again in (True, False):
             fit = self._fitted(frame, places, weight, brightness, spread, behind, 2)
@@ -278,12 +281,22 @@ class Overlap:
 
 
 def _continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Images that go on beyond their frame, falling to nothing over a sixth of its width: better than an edge."""
-    size = images.shape[1]
-    more = 2 * (size // 12)
-    away = np.abs(np.arange(-more, size + more) - (size - 1) / 2) - size // 2
-    fall = np.clip(1 - away / max(more, 1), 0, 1)
-    return np.pad(images, ((0, 0), (more, more), (more, more)), mode="edge") * np.minimum(fall, fall[:, None])
+    """Images that go on beyond their frame: the light along each side falls on as a parabola about the middle does."""
+    half = images.shape[1] // 2
+    more, depth = 2 * (half // 3), max(half // 4, 2)
+    away = np.arange(-half - more, half + more + 1)
+    rim, fall = np.abs(away) > half, []
+    for axis in (1, 2):
+        light, factor = images.mean(axis=3 - axis), np.ones((len(images), len(away)), np.float32)
+        for side in (away[more : more + depth], away[-more - depth : -more]):
+            bend, middle = np.polyfit(side**2, light[:, side + half].T, 1)
+            end = np.where(bend * middle < 0, -middle / np.where(bend == 0, 1, bend), 0)
+            end = np.clip(median_filter(end, 5, mode="nearest")[:, None], (half + 1) ** 2, (half + more) ** 2)
+            beyond = rim & (away * side[0] > 0)
+            factor[:, beyond] = np.clip((end - away[beyond] ** 2) / (end - half**2), 0, 1)
+        fall.append(factor)
+    down, across = fall
+    return np.pad(images, ((0, 0), (more, more), (more, more)), mode="edge") * (down[:, :, None] * across[:, None, :])
 
 
 def _high_passed(images: NDArray, blur: float) -> NDArray[np.float32]:
@@ -304,17 +317,23 @@ def _brightness(places: NDArray, brightness: float, spread: float) -> tuple[floa
 
 
 def _variance(light: NDArray, residual: NDArray, noise: float, bins: int = 12) -> NDArray[np.float64]:
-    """Polynomial of a pixel's variance in the particles' light: read noise, photon noise, errors of the images."""
+    """A pixel's variance as a line in the particles' light: photon noise over read noise.
+
+    The images' own errors grow with the square of the light. That is found, too, but left out: these errors are those of
+    a few patterns, not of single pixels, and to trust bright pixels less for them costs more than they do.
+    """
     light, residual = np.abs(light[::3, ::3]).ravel(), np.abs(residual[::3, ::3]).ravel()  # enough of them
     rank, dark = np.argsort(light), np.count_nonzero(light == 0)
     # Of few particles, light falls on few pixels.
     parts = [part for part in (rank[:dark], *np.array_split(rank[dark:], bins - 1)) if len(part) > 50]
     values = np.array([(light[part].mean(), (np.median(residual[part]) / 0.6745) ** 2) for part in parts])
     if len(values) < 4:
-        return np.array([0, 0, noise**2])
-    variance = np.polyfit(values[:, 0], values[:, 1], 2, w=1 / np.maximum(values[:, 1], 0.25 * noise**2))
-    variance[-1] = max(variance[-1], 0.25 * noise**2)
-    return variance
+        return np.array([0, noise**2])
+    light, variance = values.T
+    sure, brightest = 1 / np.maximum(variance, 0.25 * noise**2), max(light.max(), 1e-9)
+    terms = (light[:, None] / brightest) ** np.arange(3)
+    level, linear, _ = nnls(terms * sure[:, None], variance * sure)[0]
+    return np.array([linear / brightest, max(level, 0.25 * noise**2)])
 
 
 def _weight(light: NDArray[np.float32], variance: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -325,8 +344,7 @@ def _weight(light: NDArray[np.float32], variance: NDArray[np.float64]) -> NDArra
 
 
 @compiled
-def _fill_weight(light, square, linear, level, weight):  # pragma: no cover
+def _fill_weight(light, linear, level, weight):  # pragma: no cover
     for r in range(light.shape[0]):
         for c in range(light.shape[1]):
-            size = abs(light[r, c])
-            weight[r, c] = 1 / max((square * size + linear) * size + level, np.float32(0.25) * level)
+            weight[r, c] = 1 / (linear * abs(light[r, c]) + level)

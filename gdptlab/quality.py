@@ -5,8 +5,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gdptlab.autocalibrate import ScanCalibration
-from gdptlab.calibration import Calibration, noise_level
+from gdptlab.calibration import Calibration
 from gdptlab.check import positive
+from gdptlab.denoising import noise_level
 
 TWIN = 0.95
 """Correlation from which on images at two depths are mistaken for each other."""

@@ -16,8 +16,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab.calibration import Calibration, noise_level
+from gdptlab.calibration import Calibration
 from gdptlab.check import choice, positive, real_array, whole
+from gdptlab.denoising import noise_level
 from gdptlab.locate import METHODS, locate
 
 LOWEST = 0.2

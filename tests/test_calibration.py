@@ -10,8 +10,9 @@ import pytest
 from conftest import CALIBRATION_SEED, IMAGE_TYPES, SIZE_PX, Z_UM, table
 
 from gdptlab import Calibration, locate
-from gdptlab.calibration import VERSION, denoised, levelled, noise_level
+from gdptlab.calibration import VERSION, levelled
 from gdptlab.correlation import correlate_plainly, normalised
+from gdptlab.denoising import denoised, noise_level
 
 DENOISED_BY = 4  # times smaller 1 - NCC of the worst image against the noise-free stack, at least
 CENTRE_PX = 0.1  # mean error of x and y with a calibration cut out of a scan
