@@ -4,7 +4,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter1d
 
 WINDOW = 11
 """Images that are filtered together."""
@@ -12,8 +12,8 @@ WINDOW = 11
 BLOCK = 16
 """Rows and columns that are filtered together; blocks overlap by half."""
 
-SMOOTHED = (0.7, 1.5, 1.5)
-"""Orders along z, and frequencies in the block, over which the power of its spectrum is smoothed."""
+SMOOTHED = (1.5, 1.5, 0.7)
+"""Frequencies in the block, and orders along z, over which the power of its spectrum is smoothed."""
 
 DOUBT = 2.0
 """Times the power of the noise that is taken from that power. As it still scatters, of noise alone next to nothing is
@@ -48,6 +48,7 @@ def denoised(stack: NDArray) -> NDArray[np.float32]:
             quarter = (part + across * part[:, :, ::-1])[:, half - over :, half - over :] / 2
             quarter = _filtered(quarter, variance)[:, over:, over:]
             smooth += quarter[:, np.abs(away)][:, :, np.abs(away)] * (y_side[:, None] * x_side)
+    levels -= smooth.mean(axis=(1, 2), keepdims=True)
     return (smooth + levels).astype(np.float32)
 
 
@@ -57,6 +58,11 @@ def _filtered(stack: NDArray[np.float32], variance: float) -> NDArray[np.float32
     # Polynomials, not cosines, as images still change at the ends of a window.
     along_z = np.linalg.qr(np.vander(np.linspace(-1, 1, count), increasing=True))[0].astype(np.float32)
     trust = (1 - np.abs(np.arange(count) - (count - 1) / 2) / ((count + 1) / 2)).astype(np.float32) ** 2
+    sizes = (edge, edge, count)
+    blurs = [
+        gaussian_filter1d(np.eye(n, dtype=np.float32), sigma, axis=0, mode="nearest")
+        for n, sigma in zip(sizes, SMOOTHED, strict=True)
+    ]
     taper = np.sin((np.arange(edge) + 0.5) * np.pi / edge).astype(np.float32)
     taper = taper[:, None] * taper
     starts = np.rint(np.linspace(0, stack.shape[1] - edge, -(-2 * (stack.shape[1] - edge) // edge) + 1)).astype(int)
@@ -65,7 +71,8 @@ def _filtered(stack: NDArray[np.float32], variance: float) -> NDArray[np.float32
         for left in starts:
             block = np.s_[:, top : top + edge, left : left + edge]
             spectra = sliding_window_view(dctn(stack[block], axes=(1, 2), norm="ortho"), count, axis=0) @ along_z
-            power = gaussian_filter(spectra**2, (0, *SMOOTHED[1:], SMOOTHED[0]), mode="nearest")
+            power = blurs[0] @ (spectra**2 @ blurs[2].T).reshape(len(spectra), edge, -1)
+            power = blurs[1] @ power.reshape(spectra.shape)
             spectra *= 1 - np.minimum(DOUBT * variance / np.where(power > 0, power, 1), 1)
             filtered, together = np.zeros_like(stack[block]), np.zeros((len(stack), 1, 1), np.float32)
             for k, each in enumerate(trust):

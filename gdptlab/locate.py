@@ -40,9 +40,13 @@ COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": b
 STD_COLUMNS = ("x_std_px", "y_std_px", "z_std_um")
 """More of them, if particles are fitted jointly."""
 
-CORRELATED = 6.0
+CORRELATED = 5.0
 """Pixels over which what a joint fit leaves of a particle is alike, about, where it is more than noise: an excess of
-chi2 by 0.1 adds 0.6 times the variance. Found as what makes errors of particles in a crowd agree with their std."""
+chi2 by 0.1 adds 0.5 times the variance. Found as what makes errors of particles in a crowd agree with their std."""
+
+ODD = 3.0
+"""Standard deviations by which a particle is brighter or fainter than the others where its variance is twice the usual:
+it may not be alone."""
 
 METHODS = ("correlation", "joint")
 """How `locate` can work."""
@@ -118,7 +122,7 @@ def locate(
         first = _pixels(image, calibration, place)
         shift = calibration.displacement(image, first, np.rint(step))
         place = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
-    return _table(place, step, cm, calibration)
+    return _table(place, step, cm, calibration.z_um)
 
 
 def _checked(
@@ -143,14 +147,14 @@ def _image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
     return image
 
 
-def _table(place: NDArray, step: NDArray, cm: NDArray, calibration: Calibration) -> pd.DataFrame:
-    """What `locate` returns, of places (y, x) (n, 2), z in steps of the stack and C_m."""
-    last = len(calibration) - 1
+def _table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.DataFrame:
+    """What `locate` returns, of places (y, x) (n, 2), z in steps of the stack, C_m, and the depths of the steps."""
+    last = len(z_um) - 1
     return pd.DataFrame(
         {
             "x_px": place[:, 1].astype(float),
             "y_px": place[:, 0].astype(float),
-            "z_um": np.interp(step, np.arange(last + 1), calibration.z_um),
+            "z_um": np.interp(step, np.arange(last + 1), z_um),
             "cm": np.minimum(cm, 1).astype(float),
             "at_end": (step <= 0) | (step >= last),
         }
@@ -169,11 +173,13 @@ def _overlapping(
         explained = plan.following(image, before)
     fit = explained.fit
     y, x, step, brightness = fit.places.T
-    table = _table(fit.places[:, :2], step, fit.cm, calibration)
+    z_um = calibration.z_um
+    table = _table(fit.places[:, :2], step, fit.cm, np.clip(z_um - calibration.own_bias_um, z_um[0], z_um[-1]))
     steps = np.arange(len(calibration))
     y_std, x_std, step_std = fit.std.T
-    stds = x_std, y_std, step_std * np.interp(step, steps, np.gradient(calibration.z_um))
-    misfit = np.sqrt(1 + CORRELATED * np.maximum(fit.chi2 - 1, 0))
+    stds = x_std, y_std, step_std * np.interp(step, steps, np.gradient(z_um))
+    odd = (brightness - explained.brightness) / explained.spread
+    misfit = np.sqrt(1 + CORRELATED * np.maximum(fit.chi2 - 1, 0) + (odd / ODD) ** 2)
     for name, noise, own in zip(STD_COLUMNS, stds, calibration.own_error.T, strict=True):
         table[name] = misfit * np.hypot(noise, np.interp(step, steps, own))
     inside = explained.stays & (y >= -0.5) & (y < image.shape[0] - 0.5) & (x >= -0.5) & (x < image.shape[1] - 0.5)

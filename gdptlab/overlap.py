@@ -319,8 +319,8 @@ def _brightness(places: NDArray, brightness: float, spread: float) -> tuple[floa
 def _variance(light: NDArray, residual: NDArray, noise: float, bins: int = 12) -> NDArray[np.float64]:
     """A pixel's variance as a line in the particles' light: photon noise over read noise.
 
-    The images' own errors grow with the square of the light. That is found, too, but left out: these errors are those of
-    a few patterns, not of single pixels, and to trust bright pixels less for them costs more than they do.
+    The images' own errors grow with the square of the light. That is found, too, but left out: these errors are
+    those of a few patterns, not of single pixels, and to trust bright pixels less for them costs more than they do.
     """
     light, residual = np.abs(light[::3, ::3]).ravel(), np.abs(residual[::3, ::3]).ravel()  # enough of them
     rank, dark = np.argsort(light), np.count_nonzero(light == 0)
