@@ -86,7 +86,7 @@ def locate_plainly(
     y, x, cm, step = np.array(found).reshape(-1, 4).T
     place = np.stack([y, x], axis=1) + half
     kept = strongest(place, np.where(cm >= threshold, cm, 0), distance)
-    return _table(place[kept], step[kept], cm[kept], calibration)
+    return _table(place[kept], step[kept], cm[kept], calibration.z_um)
 
 
 def _climbed(
