@@ -158,7 +158,7 @@ def _spline(f):  # pragma: no cover
 
 @compiled
 def _draw(nodes, width, places, boxes, starts, values):  # pragma: no cover
-    """Fill `values` (4, pixels). Along z, then x, then y; rows are kept whole, so that loops are long."""
+    """Fill `values` (4, pixels). Along z over the nodes in reach, then x, then y; rows lie end to end: loops are long."""
     half = (width - 2 * RIM) // 2
     scratch = np.zeros((5, width * width + 3), np.float32)
     a, b, c, d, e = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
@@ -174,20 +174,22 @@ def _draw(nodes, width, places, boxes, starts, values):  # pragma: no cover
         (z0, z1, z2, z3), (dz0, dz1, dz2, dz3) = _spline(step - k)
         (v0, v1, v2, v3), (dv0, dv1, dv2, dv3) = _spline(top - row)
         (h0, h1, h2, h3), (dh0, dh1, dh2, dh3) = _spline(left - column)
-        begin, end = (row + 1) * width, (row + rows + 4) * width
-        n0, n1, n2, n3 = nodes[k, begin:end], nodes[k + 1, begin:end], nodes[k + 2, begin:end], nodes[k + 3, begin:end]
-        length = end - begin
-        for j in range(length):
-            a[j] = z0 * n0[j] + z1 * n1[j] + z2 * n2[j] + z3 * n3[j]
-            b[j] = dz0 * n0[j] + dz1 * n1[j] + dz2 * n2[j] + dz3 * n3[j]
+        across = columns + 3
+        for r in range(rows + 3):
+            s, t = (row + 1 + r) * width + column + 1, r * across
+            n0, n1, n2, n3, a0, b0 = nodes[k, s:], nodes[k + 1, s:], nodes[k + 2, s:], nodes[k + 3, s:], a[t:], b[t:]
+            for j in range(across):
+                a0[j] = z0 * n0[j] + z1 * n1[j] + z2 * n2[j] + z3 * n3[j]
+                b0[j] = dz0 * n0[j] + dz1 * n1[j] + dz2 * n2[j] + dz3 * n3[j]
+        length = (rows + 3) * across
         for j in range(length):
             c[j] = h0 * a[j] + h1 * a[j + 1] + h2 * a[j + 2] + h3 * a[j + 3]
             d[j] = dh0 * a[j] + dh1 * a[j + 1] + dh2 * a[j + 2] + dh3 * a[j + 3]
             e[j] = h0 * b[j] + h1 * b[j + 1] + h2 * b[j + 2] + h3 * b[j + 3]
-        length -= 3 * width
-        c1, c2, c3 = c[width:], c[2 * width :], c[3 * width :]
-        d1, d2, d3 = d[width:], d[2 * width :], d[3 * width :]
-        e1, e2, e3 = e[width:], e[2 * width :], e[3 * width :]
+        length -= 3 * across
+        c1, c2, c3 = c[across:], c[2 * across :], c[3 * across :]
+        d1, d2, d3 = d[across:], d[2 * across :], d[3 * across :]
+        e1, e2, e3 = e[across:], e[2 * across :], e[3 * across :]
         for j in range(length):
             a[j] = v0 * c[j] + v1 * c1[j] + v2 * c2[j] + v3 * c3[j]
             b[j] = dv0 * c[j] + dv1 * c1[j] + dv2 * c2[j] + dv3 * c3[j]
@@ -197,7 +199,7 @@ def _draw(nodes, width, places, boxes, starts, values):  # pragma: no cover
             d[j] = v0 * e[j] + v1 * e1[j] + v2 * e2[j] + v3 * e3[j]
         light = np.float32(brightness)
         for r in range(rows):
-            s, t = starts[i] + r * columns, r * width + column + 1
+            s, t = starts[i] + r * columns, r * across
             j0, j1, j2, j3 = values[0, s:], values[1, s:], values[2, s:], values[3, s:]
             b0, c0, d0, a0 = b[t:], c[t:], d[t:], a[t:]
             for q in range(columns):
