@@ -322,7 +322,7 @@ def _variance(light: NDArray, residual: NDArray, noise: float, bins: int = 12) -
     The images' own errors grow with the square of the light. That is found, too, but left out: these errors are
     those of a few patterns, not of single pixels, and to trust bright pixels less for them costs more than they do.
     """
-    light, residual = np.abs(light[::4, ::4]).ravel(), np.abs(residual[::4, ::4]).ravel()  # enough of them
+    light, residual = np.abs(light[::3, ::3]).ravel(), np.abs(residual[::3, ::3]).ravel()  # enough of them
     rank, dark = np.argsort(light), np.count_nonzero(light == 0)
     # Of few particles, light falls on few pixels.
     parts = [part for part in (rank[:dark], *np.array_split(rank[dark:], bins - 1)) if len(part) > 50]

@@ -158,7 +158,7 @@ def _spline(f):  # pragma: no cover
 
 @compiled
 def _draw(nodes, width, places, boxes, starts, values):  # pragma: no cover
-    """Fill `values` (4, pixels). Along z over the nodes in reach, then x, then y; rows lie end to end: loops are long."""
+    """Fill `values` (4, pixels): along z over the nodes in reach, then x, then y."""
     half = (width - 2 * RIM) // 2
     scratch = np.zeros((5, width * width + 3), np.float32)
     a, b, c, d, e = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]

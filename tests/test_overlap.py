@@ -301,8 +301,8 @@ def test_following_frames_begin_with_the_last(microscope, calibration):
 def test_noise_is_learnt_from_what_is_left(wrong):
     """Read noise and photon noise, and not what is wrong with the images, which grows with the square of the light."""
     rng = np.random.default_rng(270)
-    light = np.zeros((300, 300), np.float32)
-    light[100:220, 50:180] = rng.gamma(2, 300, (120, 130))
+    light = np.zeros((900, 900), np.float32)
+    light[100:820, 50:780] = rng.gamma(2, 300, (720, 730))
     variance = 38.0**2 + 2 * light
     residual = (rng.normal(size=light.shape) * np.sqrt(variance + (wrong * light) ** 2)).astype(np.float32)
     learnt = _variance(light, residual, 38.0)
