@@ -138,7 +138,7 @@ class _Search:
         self._filter = calibration._plans[key]
         self._surface = Background(frame.shape, 4 * calibration.reach_px)
         self.noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame))) or 1.0
-        self.variance = np.array([self.noise**2, PHOTONS, MISFIT**2])
+        self.noise_and_photons, self.misfit = (self.noise**2, PHOTONS), MISFIT
         self.places = np.zeros((0, 4))
         self.fit: JointFit = self._fitted(0)
 
@@ -191,7 +191,7 @@ class _Search:
             self._images,
             self.frame,
             self.places,
-            self._weight(light),
+            (1 / self._variance(light)).astype(np.float32),
             brightness=1.0,
             spread=FREE,
             steps=steps,
@@ -200,28 +200,29 @@ class _Search:
         self.places = fit.places
         return fit
 
-    def _weight(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
-        level, linear, square = (np.float32(c) for c in self.variance)
-        light = np.maximum(light, 0)
-        return 1 / (level + (linear + square * light) * light)
+    def _variance(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Of pixels, read noise and photons only (see `overlap._variance`)."""
+        level, photons = self.noise_and_photons
+        return level + photons * np.maximum(light, 0)
 
     def _learn_variance(self) -> None:
-        """Of a pixel's variance: noise, photons, and what grows with the light's square; none below nothing."""
+        """Of a pixel's variance: read noise, photons, and the patterns' own error; none below nothing."""
         light, left = self.fit.light.ravel(), self.fit.residual.ravel()
         parts = np.array_split(np.argsort(light), 100)[20:]  # in most frames most is dark
         mean = np.array([max(light[part].mean(), 0) for part in parts])
         spread = np.array([(np.median(np.abs(left[part])) / 0.6745) ** 2 for part in parts])
         spread = np.maximum(spread, 0.1 * self.noise**2)
         terms = np.stack([np.ones_like(mean), mean, mean**2], axis=1)
-        self.variance = nnls(terms / spread[:, None], np.ones_like(spread))[0]
+        level, photons, square = nnls(terms / spread[:, None], np.ones_like(spread))[0]
+        self.noise_and_photons = max(level, 0.5 * self.noise**2), photons
         # What neighbouring pixels share does not show in them one by one: no less than in the scan.
-        self.variance[2] = max(self.variance[2], MISFIT**2)
-        self.variance[0] = max(self.variance[0], 0.5 * self.noise**2)
+        self.misfit = max(np.sqrt(square), MISFIT)
 
     def _new(self, whiten: bool) -> NDArray[np.float64]:
         """Places of further particles, of which each stands out from all that is near."""
         # Where there is light, part of what is left is the patterns' own error.
-        left = self.fit.residual * np.sqrt(self._weight(self.fit.light)) * np.float32(self.noise)
+        variance = self._variance(self.fit.light) + (self.misfit * self.fit.light) ** 2
+        left = self.fit.residual * (self.noise / np.sqrt(variance)).astype(np.float32)
         new, gain = self._filter(left, self.noise, whiten=whiten, least=LEAST_GAIN, share=0, apart_px=4)
         new, gain = (a[np.argsort(-gain, kind="stable")] for a in (new, gain))
         keep = []
@@ -278,7 +279,7 @@ class _Search:
             columns = self._images.draw(trials, self.frame.shape)
             sums = np.zeros((len(trials), 15))
             _local(
-                fit.residual, fit.light, self.places[:, 3], owner, trials[:, 3], self.variance,
+                fit.residual, fit.light, self.places[:, 3], owner, trials[:, 3], self.noise_and_photons,
                 own.boxes, own.starts, own.values, columns.boxes, columns.starts, columns.values, sums,
             )  # fmt: skip
             if step == CLIMB:
@@ -299,14 +300,14 @@ class _Search:
 
 @compiled
 def _local(
-    left, light, brightness, owner, trial, variance, boxes, starts, values, t_boxes, t_starts, t_values, sums
+    left, light, brightness, owner, trial, noise_and_photons, boxes, starts, values, t_boxes, t_starts, t_values, sums
 ):  # pragma: no cover
     """Sums over the pixels of each trial: upper triangle of its matrix (10), gradient (4), gain in log-likelihood.
 
     A trial stands in the stead of its owner, whose light goes back into what is left. Each pixel's variance is that
     of the light of all others and of the trial.
     """
-    v0, v1, v2 = np.float32(variance[0]), np.float32(variance[1]), np.float32(variance[2])
+    level, photons = np.float32(noise_and_photons[0]), np.float32(noise_and_photons[1])
     zero = np.float32(0)
     column = np.empty(4, np.float32)
     for i in range(len(t_boxes)):
@@ -323,10 +324,10 @@ def _local(
                     seen += back
                     others -= back
                 others = max(others, zero)
-                before = v0 + (v1 + v2 * others) * others
+                before = level + photons * others
                 image = bright * t_values[3, s]
                 others += max(image, zero)
-                after = v0 + (v1 + v2 * others) * others
+                after = level + photons * others
                 rest = seen - image
                 total += seen * seen / before - rest * rest / after + np.log(before / after)
                 q = 0

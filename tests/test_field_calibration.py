@@ -157,11 +157,11 @@ def test_learned_beads_are_the_true_ones(scan, calibration):
 
 
 def test_pattern_of_a_place(calibration):
-    """Beads are brighter on their right on the right of the field, and the other way about on the left."""
-    right, left = (calibration.pattern(x, 100, SHAPE)[3] for x in (235, 25))
-    assert right.shape == (2 * REACH + 1,) * 2
-    mirrored, as_is = (np.corrcoef(image.ravel(), left.ravel())[0, 1] for image in (right[:, ::-1], right))
-    assert mirrored > as_is
+    """Beads are brighter on their right on the right of the field, and the less so the farther left they are."""
+    patterns = [calibration.pattern(x, 100, SHAPE) for x in (25, 130, 235)]
+    assert patterns[0][3].shape == (2 * REACH + 1,) * 2
+    leans = [(p[:, :, REACH + 1 :].sum((1, 2)) - p[:, :, :REACH].sum((1, 2))) / p.sum((1, 2)) for p in patterns]
+    assert (np.diff(leans, axis=0) > 0).all()
 
 
 def test_depths_may_fall(scan, calibration):
@@ -195,7 +195,7 @@ def test_both_depths_are_reported(measured, calibration):
     table, _ = measured
     assert np.isfinite(table["z_other_um"]).all()
     assert (table["ambiguous"] == (table["log_ratio"] < AMBIGUOUS)).all()
-    assert (table.loc[table["frame"] == 0, "log_ratio"] > -1).mean() > 0.95
+    assert (table.loc[table["frame"] == 0, "log_ratio"] > -2).mean() > 0.95
 
 
 def test_plane_decides(measured):
