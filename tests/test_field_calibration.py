@@ -161,7 +161,7 @@ def test_pattern_of_a_place(calibration):
     patterns = [calibration.pattern(x, 100, SHAPE) for x in (25, 130, 235)]
     assert patterns[0][3].shape == (2 * REACH + 1,) * 2
     leans = [(p[:, :, REACH + 1 :].sum((1, 2)) - p[:, :, :REACH].sum((1, 2))) / p.sum((1, 2)) for p in patterns]
-    assert (np.diff(leans, axis=0) > 0).all()
+    assert (np.diff(np.median(leans, axis=1)) > 0).all()
 
 
 def test_depths_may_fall(scan, calibration):
