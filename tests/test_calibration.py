@@ -7,14 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import CALIBRATION_SEED, IMAGE_TYPES, SIZE_PX, Z_UM, table
+from conftest import CALIBRATION_SEED, IMAGE_TYPES, Z_UM, table
 
 from gdptlab import Calibration, locate
 from gdptlab.calibration import VERSION, levelled
 from gdptlab.correlation import correlate_plainly, normalised
-from gdptlab.denoising import denoised, noise_level
 
-DENOISED_BY = 4  # times smaller 1 - NCC of the worst image against the noise-free stack, at least
 CENTRE_PX = 0.1  # mean error of x and y with a calibration cut out of a scan
 CENTRE_Z_UM = 1.0  # likewise of z
 
@@ -107,38 +105,9 @@ def test_n_keeps_images_evenly_spread(stacks, n, kept):
 # -------------------- denoising
 
 
-@pytest.mark.parametrize("seed", [71, 72, 73])
-@pytest.mark.parametrize("n", [51, 11, 6])
-def test_denoising_brings_images_nearer_to_noise_free_ones(microscope, clean_stack, n, seed):
-    keep = np.rint(np.linspace(0, 50, n)).astype(int)
-    noisy = microscope.stack(Z_UM[keep], SIZE_PX, rng=seed).astype(np.float32)
-    before, after = distance(noisy, clean_stack[keep]), distance(denoised(noisy), clean_stack[keep])
-    assert (after < before).all()
-    assert after.max() < before.max() / DENOISED_BY
-    assert after.mean() < before.mean() / DENOISED_BY
-
-
-def test_denoising_leaves_a_clean_stack_as_it_is(clean_stack):
-    assert distance(denoised(clean_stack.astype(np.float32)), clean_stack).max() < 2e-4
-
-
-def test_denoising_keeps_levels(stacks):
-    for kind in IMAGE_TYPES:
-        stack = stacks[kind].astype(np.float32)
-        np.testing.assert_allclose(denoised(stack).mean(axis=(1, 2)), stack.mean(axis=(1, 2)), atol=0.1)
-
-
 def test_denoise_can_be_left_out(stacks):
     raw = Calibration.from_stack(stacks["fluorescent"], Z_UM, denoise=False)
     np.testing.assert_allclose(raw.templates, normalised(levelled(raw.stack)), atol=1e-7)
-
-
-@pytest.mark.parametrize("sigma", [3.0, 38.0])
-def test_noise_level(clean_stack, sigma):
-    noise = np.random.default_rng(1).normal(0, sigma, clean_stack.shape)
-    assert noise_level(noise) == pytest.approx(sigma, rel=0.02)
-    assert noise_level(noise[0]) == pytest.approx(sigma, rel=0.1)
-    assert noise_level(clean_stack + noise) == pytest.approx(sigma, rel=0.3 if sigma < 10 else 0.05)
 
 
 def test_levelled_takes_out_any_plane():
@@ -632,12 +601,3 @@ def test_a_particle_cut_by_the_border_is_refused(microscope) -> None:
 
 def test_a_calibration_says_what_it_is(calibration) -> None:
     assert repr(calibration).startswith("<Calibration: 51 images of 61 by 61 px, z = -50 to 50 µm, 9 in the subset")
-
-
-def test_denoised_images_are_nearer_to_the_truth_in_every_part(clean_stack, stacks) -> None:
-    """Of a particle that is its own mirror image, what is not symmetric is noise, and goes."""
-    smooth = denoised(stacks["fluorescent"])
-    odd = (smooth - smooth[:, :, ::-1]) / 2
-    noise = noise_level(stacks["fluorescent"])
-    assert np.sqrt((odd**2).mean()) < 0.03 * noise
-    assert np.sqrt(((smooth - clean_stack + clean_stack.mean() - smooth.mean()) ** 2).mean()) < 0.3 * noise

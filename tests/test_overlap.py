@@ -294,6 +294,36 @@ def test_following_frames_begin_with_the_last(microscope, calibration):
     np.testing.assert_allclose(np.median(explained.velocity, axis=0), (-1, 2, 0.25), atol=0.1)
 
 
+def test_depths_are_less_the_bias_of_the_calibration(microscope):
+    """With one noisy exposure it is a good part of the error at the ends of the stack, and of all error."""
+    with_it, without = [], []
+    for seed in (281, 282, 283):
+        made = Calibration.from_stack(microscope.stack(Z_UM, 63, rng=seed), Z_UM)
+        rng = np.random.default_rng(seed)
+        true = pd.concat([on_grid(rng).assign(frame=k) for k in range(3)], ignore_index=True)
+        frames = [microscope.render(part, (512, 700), rng=rng) for _, part in true.groupby("frame")]
+        found = pd.concat([locate(f, made, method="joint").assign(frame=k) for k, f in enumerate(frames)])
+        found = found.reset_index(drop=True)
+        pairs = match(found, true)
+        rows, error = found.loc[pairs["measured"]], pairs["dz_um"].to_numpy()
+        without.append(error / rows["z_std_um"].to_numpy())
+        with_it.append((error + np.interp(rows["z_um"], Z_UM, made.own_bias_um)) / rows["z_std_um"].to_numpy())
+    assert np.square(np.concatenate(without)).mean() < np.square(np.concatenate(with_it)).mean()
+
+
+def test_an_odd_brightness_widens_error_bars(microscope, calibration):
+    """One that is brighter than all others by three tenths may be two."""
+    true = on_grid(np.random.default_rng(284), (300, 400), 90).assign(brightness=1.0)
+    stds = []
+    for brightness in (1.0, 1.3):
+        true.loc[4, "brightness"] = brightness
+        found = joint(microscope.render(true, (300, 400), rng=285), calibration)
+        away = np.hypot(found["x_px"] - true["x_px"][4], found["y_px"] - true["y_px"][4])
+        assert away.min() < 1
+        stds.append(found["z_std_um"][away.idxmin()])
+    assert stds[1] > 2 * stds[0]
+
+
 # -------------------- parts
 
 
@@ -343,6 +373,15 @@ def test_images_go_on_beyond_their_frame(calibration):
     rim = images.copy()
     rim[:, 1:-1, 1:-1] = 0
     assert np.abs(rim).max() < np.abs(calibration.images[:, [0, -1]]).max() / 2
+
+
+def test_light_beyond_the_frame_is_about_what_was_cut_off(microscope):
+    """At the far end a tenth of a particle's light falls outside of a template."""
+    whole = np.stack([microscope.light(table(60, 60, z), (121, 121)) for z in Z_UM]).astype(np.float32)
+    images = _continued(whole[:, 30:-30, 30:-30])
+    total, cut, drawn = (a.sum(axis=(1, 2)) for a in (whole, whole[:, 30:-30, 30:-30], images))
+    assert (total / cut)[-1] > 1.1
+    np.testing.assert_allclose(drawn / total, 1, atol=0.02)
 
 
 def test_high_pass_takes_out_what_is_smooth():
