@@ -256,8 +256,8 @@ class Calibration:
         """The particle's own light, (N, n, n): the stack, denoised, less its background, in the stack's counts.
 
         Templates have no level and no slope; here both are put back, smooth in z as the light itself, but for the
-        background, which is that of the images whose outermost pixels are faintest (most bright, for dark particles): there the particle
-        is smallest.
+        background, which is that of the images whose outermost pixels are faintest (most bright, for dark
+        particles): there the particle is smallest.
         """
         flat = self.templates.reshape(len(self), -1)
         strength = np.einsum("kp,kp->k", levelled(self.stack).reshape(len(self), -1), flat)
