@@ -6,6 +6,8 @@ from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 from scipy.ndimage import gaussian_filter1d
 
+from gdptlab.cores import on_one_core
+
 WINDOW = 11
 """Images that are filtered together."""
 
@@ -20,6 +22,7 @@ DOUBT = 2.0
 left."""
 
 
+@on_one_core
 def denoised(stack: NDArray) -> NDArray[np.float32]:
     """Smooth model of a stack: a Wiener filter along z and in the image, in small blocks.
 
