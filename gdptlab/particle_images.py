@@ -94,10 +94,7 @@ class ParticleImages:
         nodes = np.pad(images.astype(np.float64), ((0, 0), (RIM, RIM), (RIM, RIM)))
         for axis in (1, 2):
             nodes = spline_filter1d(nodes, axis=axis)
-        # One image beyond either end, by the line through the last two.
-        first, last = (2 * nodes[i] - nodes[j] for i, j in ((0, 1), (-1, -2)))
-        nodes = spline_filter1d(np.concatenate([first[None], nodes, last[None]]), axis=0)
-        self._nodes = np.ascontiguousarray(nodes.reshape(len(nodes), -1), dtype=np.float32)
+        self._nodes = along_z(nodes.reshape(len(nodes), -1)).astype(np.float32)
         self.reach = _reach(images, noise)
 
     def boxes(self, places: NDArray, shape: tuple[int, int]) -> NDArray[np.int64]:
@@ -133,6 +130,22 @@ class ParticleImages:
         values = np.empty((4, starts[-1]), dtype=np.float32)
         _draw(self._nodes, self.size + 2 * RIM, places, boxes, starts, values)
         return Columns(boxes, starts, values)
+
+
+def along_z(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients (N + 2, ...) of the cubic spline through values (N, ...), one more beyond either end.
+
+    Nothing is known of the ends but the values: the last two pieces are one cubic ("not a knot"), or, of few values,
+    the end is straight.
+    """
+    count = len(values)
+    end = np.array([1, -4, 6, -4, 1] if count > 4 else [1, -2, 1])
+    matrix = np.zeros((count + 2, count + 2))
+    matrix[0, : len(end)] = matrix[-1, -len(end) :] = end
+    for k in range(count):
+        matrix[k + 1, k : k + 3] = 1 / 6, 4 / 6, 1 / 6
+    ends = np.zeros((1, *values.shape[1:]))
+    return np.einsum("kn,n...->k...", np.linalg.inv(matrix), np.concatenate([ends, values, ends]), optimize=True)
 
 
 def _reach(images: NDArray, noise: float) -> NDArray[np.int64]:
