@@ -46,9 +46,6 @@ RECENTRED = 4
 STANDS_OUT = 4.0
 """Height of a particle, over the noise of a pixel, from which on it is one."""
 
-ALIKE = 0.9
-"""Correlation of a particle's images with those of others from which on their mean serves for all."""
-
 LOSSLESS = 0.98
 """Templates that keep this correlation with themselves at half resolution are searched for there."""
 
@@ -148,20 +145,18 @@ class Calibration:
         cls,
         scan: ArrayLike,
         z_um: ArrayLike,
-        x_px: ArrayLike,
-        y_px: ArrayLike,
+        x_px: float,
+        y_px: float,
         *,
         size: int | None = None,
         n_sub: int = 9,
         n: int | None = None,
         denoise: bool = True,
     ) -> Self:
-        """Calibrate with one particle of a scan of full frames, or with the mean of several.
+        """Calibrate with one particle of a scan of full frames.
 
         The particle's centre is found in every slice as the point about which its image is symmetric (under
-        half a turn), made smooth over z, and every slice is moved so that it lies on the middle pixel. The mean of
-        several particles has less noise, and, as each lies elsewhere between the pixels, it also tells how sharp images
-        look there. They should be alike, in focus at the same depth.
+        half a turn), made smooth over z, and every slice is moved so that it lies on the middle pixel.
 
         Parameters
         ----------
@@ -169,9 +164,8 @@ class Calibration:
             Frames at known depths; the particle should have no near neighbour.
         z_um : array (N,)
             Depths, strictly increasing or decreasing.
-        x_px, y_px : float, or arrays (B,)
-            About where the particle is (to a few pixels), with x to the right and y down from the first pixel; or
-            where each of several is.
+        x_px, y_px : float
+            About where the particle is (to a few pixels), with x to the right and y down from the first pixel.
         size : int, optional
             Rows and columns of the templates, odd. Without it, the smallest that holds the widest image.
         n_sub, n, denoise
@@ -180,28 +174,49 @@ class Calibration:
         Raises
         ------
         TypeError, ValueError
-            As `from_stack`; also if a particle is nearer to the border than half a template, nothing at that
-            place stands out of the noise, or one of several is unlike the others.
+            As `from_stack`; also if the particle is nearer to the border than half a template, or nothing at that
+            place stands out of the noise.
         """
         scan, z_um = real_array("scan", scan, 3), _depths(z_um)
         if len(z_um) != len(scan):
             raise ValueError(f"z_um: got {len(z_um)} depths, needed is one for each of {len(scan)} frames")
+        rows, columns = scan.shape[1:]
+        x_px, y_px = positive("x_px", x_px, zero=True), positive("y_px", y_px, zero=True)
         if size is not None and (not isinstance(size, Integral) or isinstance(size, bool)):
             raise TypeError(f"size: got {size!r}, allowed are odd whole numbers")
-        places = list(zip(_coordinates("x_px", x_px), _coordinates("y_px", y_px), strict=False))
-        if not places or not np.size(x_px) == np.size(y_px):
-            raise ValueError(
-                f"x_px, y_px: got {np.size(x_px)} and {np.size(y_px)}, allowed are as many of both, 1 or more"
-            )
-        stacks = [_around(scan, z_um, *place, size) for place in places]
-        widest = max(stack.shape[-1] for stack in stacks)
-        stacks = [
-            stack if stack.shape[-1] == widest else _around(scan, z_um, *place, widest)
-            for stack, place in zip(stacks, places, strict=True)
-        ]
-        calibration = cls.from_stack(np.mean(stacks, axis=0), z_um, n_sub=n_sub, n=n, denoise=denoise)
-        _must_be_particles(places, stacks)
+        given = size
+        for _ in range(RECENTRED):
+            room = int(min(x_px, y_px, columns - 1 - x_px, rows - 1 - y_px)) - 2
+            where = f"a particle at x_px = {x_px:g}, y_px = {y_px:g} in frames of {columns} by {rows} px"
+            if room < 1:
+                raise ValueError(f"x_px, y_px: got {where}, allowed is one 3 px or more inside")
+            if given is None:
+                half = min(room, LARGEST // 2)
+                size = _image_size(_cut(scan, x_px, y_px, half))
+                if size >= 2 * half - 1 and half == room:
+                    raise ValueError(f"x_px, y_px: got {where}, whose images reach the border: allowed is one inside")
+            if not 3 <= size <= 2 * room + 1 or size % 2 == 0:
+                raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {2 * room + 1} for {where}")
+            stack, centres = _centred(scan, z_um, x_px, y_px, size, room)
+            middle = centres.mean(axis=0)
+            if np.abs(middle - (x_px, y_px)).max() <= 1:
+                break
+            x_px, y_px = np.clip(middle, 0, (columns - 1, rows - 1)).tolist()
+        calibration = cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
+        calibration._must_stand_out(where)
         return calibration
+
+    def _must_stand_out(self, where: str) -> None:
+        """Refuse a stack in whose middle is no particle, or with a brighter one beside it."""
+        noise, edge = max(noise_level(self.stack), 1e-9), self.size // 4
+        smooth = denoised(self.stack)
+        height = np.abs(smooth - np.median(smooth, axis=(1, 2), keepdims=True)).max(axis=0) / noise
+        inside = height[edge : self.size - edge, edge : self.size - edge].max()
+        if inside < max(STANDS_OUT, height.max() / 2):
+            raise ValueError(
+                f"x_px, y_px: got {where}, where nothing stands out by more than {inside:.1f} times the noise (beside "
+                f"it, by {height.max():.1f}); needed is a particle, alone, that does so by {STANDS_OUT:g}"
+            )
 
     def __len__(self) -> int:
         return len(self.stack)
@@ -514,60 +529,6 @@ def _halved(images: NDArray) -> NDArray[np.float32]:
 def _cut(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
     x, y = round(x_px), round(y_px)
     return scan[:, y - half : y + half + 1, x - half : x + half + 1]
-
-
-def _around(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, given: int | None) -> NDArray:
-    """Images (N, size, size) of the particle about there, of the given size or of one that holds it."""
-    rows, columns = scan.shape[1:]
-    where = f"{_particle((x_px, y_px))} in frames of {columns} by {rows} px"
-    for _ in range(RECENTRED):
-        room, size = int(min(x_px, y_px, columns - 1 - x_px, rows - 1 - y_px)) - 2, given
-        if room < 1:
-            raise ValueError(f"x_px, y_px: got {where}, allowed is one 3 px or more inside")
-        if given is None:
-            half = min(room, LARGEST // 2)
-            size = _image_size(_cut(scan, x_px, y_px, half))
-            if size >= 2 * half - 1 and half == room:
-                raise ValueError(f"x_px, y_px: got {where}, whose images reach the border: allowed is one inside")
-        if not 3 <= size <= 2 * room + 1 or size % 2 == 0:
-            raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {2 * room + 1} for {where}")
-        stack, centres = _centred(scan, z_um, x_px, y_px, size, room)
-        middle = centres.mean(axis=0)
-        if np.abs(middle - (x_px, y_px)).max() <= 1:
-            break
-        x_px, y_px = np.clip(middle, 0, (columns - 1, rows - 1)).tolist()
-    return stack
-
-
-def _particle(place: tuple[float, float]) -> str:
-    return f"a particle at x_px = {place[0]:g}, y_px = {place[1]:g}"
-
-
-def _coordinates(name: str, given: ArrayLike) -> list[float]:
-    several = real_array(name, given, 1).tolist() if np.iterable(given) and not isinstance(given, str) else [given]
-    return [positive(name, one, zero=True) for one in several]
-
-
-def _must_be_particles(places: list[tuple[float, float]], stacks: list[NDArray]) -> None:
-    """Refuse a place without a particle, with a brighter one beside it, or with one that is unlike the others'."""
-    smooth = np.stack([denoised(stack) for stack in stacks])
-    for place, stack, images in zip(places, stacks, smooth, strict=True):
-        noise, edge = max(noise_level(stack), 1e-9), stack.shape[-1] // 4
-        height = np.abs(images - np.median(images, axis=(1, 2), keepdims=True)).max(axis=0) / noise
-        inside = height[edge : len(height) - edge, edge : len(height) - edge].max()
-        if inside < max(STANDS_OUT, height.max() / 2):
-            raise ValueError(
-                f"x_px, y_px: got {_particle(place)}, where nothing stands out by more than {inside:.1f} times the "
-                f"noise (beside it, by {height.max():.1f}); needed is a particle, alone, that does so by {STANDS_OUT:g}"
-            )
-    smooth = levelled(smooth).reshape(len(places), -1)
-    for place, own, others in zip(places, smooth, smooth.sum(axis=0) - smooth, strict=True):
-        alike = own @ others / np.sqrt((own @ own) * (others @ others)) if len(places) > 1 else 1
-        if alike < ALIKE:
-            raise ValueError(
-                f"x_px, y_px: got {_particle(place)}, whose images correlate with those of the others by {alike:.2f}; "
-                f"allowed are particles that do so by {ALIKE:g}"
-            )
 
 
 def _centred(

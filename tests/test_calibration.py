@@ -280,10 +280,6 @@ def test_scan_refuses_a_particle_on_the_border(scan, x, y):
         ({"x_px": np.nan}, ValueError, "^x_px: got nan"),
         ({"y_px": -3}, ValueError, "^y_px: got -3, allowed is a finite number, at least 0"),
         ({"x_px": "97"}, TypeError, "^x_px: got '97'"),
-        ({"x_px": [67, 68]}, ValueError, "^x_px, y_px: got 2 and 1, allowed are as many"),
-        ({"x_px": [], "y_px": []}, ValueError, "^x_px"),
-        ({"x_px": [[67]], "y_px": [[51]]}, ValueError, "^x_px: got shape"),
-        ({"x_px": [67, -1], "y_px": [51, 51]}, ValueError, "^x_px: got -1"),
         ({"z_um": SCAN_Z_UM[:-1]}, ValueError, "^z_um: got 25 depths, needed is one for each of 26 frames"),
         ({"z_um": np.full(26, 3.0)}, ValueError, "^z_um: got depths that turn or repeat"),
         ({"scan": np.zeros((60, 60))}, ValueError, r"^scan: got shape \(60, 60\), allowed are 3 axes"),
@@ -572,47 +568,6 @@ def test_plans_stay_behind_when_a_calibration_is_sent(stacks):
     assert "own_error" in sent.__dict__  # what is made only once goes with it
     np.testing.assert_array_equal(sent.templates, made.templates)
     assert sent.plan(Planned, (70, 80)).calibration is sent
-
-
-@pytest.fixture(scope="module")
-def scan_of_several(microscope):
-    """Frames of nine beads between the pixels, the last of them 20 µm above the others; and where they are."""
-    rng = np.random.default_rng(CALIBRATION_SEED + 6)
-    x, y = np.array([a.ravel() for a in np.meshgrid([50, 140, 230], [50, 140, 230])]) + rng.uniform(-4, 4, (2, 9))
-    above = np.append(np.zeros(8), 20)
-    frames = [microscope.render(table(x, y, np.minimum(z + above, 50)), (280, 280), rng=rng) for z in SCAN_Z_UM]
-    return np.stack(frames), x, y
-
-
-def test_several_particles_are_better_than_one(microscope, scan_of_several):
-    frames, x, y = scan_of_several
-    several = Calibration.from_scan(frames, SCAN_Z_UM, x[:8].round(), y[:8].round(), size=61)
-    one = Calibration.from_scan(frames, SCAN_Z_UM, x[0].round(), y[0].round(), size=61)
-    errors = [measured_errors(microscope, made, "fluorescent") for made in (several, one)]
-    off, off_of_one = (np.sqrt((e**2).mean(axis=0)) for e in errors)
-    print(off, off_of_one)
-    assert (off < off_of_one).all()
-    assert (several.own_error < one.own_error).mean() > 0.9
-
-
-def test_a_list_of_one_is_one(scan):
-    single = Calibration.from_scan(scan[1], SCAN_Z_UM, 67, 51, size=31)
-    listed = Calibration.from_scan(scan[1], SCAN_Z_UM, [67], np.array([51.0]), size=31)
-    np.testing.assert_array_equal(single.templates, listed.templates)
-
-
-def test_the_widest_of_several_sets_the_size(scan_of_several):
-    frames, x, y = scan_of_several
-    sizes = [Calibration.from_scan(frames, SCAN_Z_UM, x[k], y[k]).size for k in range(3)]
-    assert Calibration.from_scan(frames, SCAN_Z_UM, x[:3], y[:3]).size == max(sizes)
-
-
-def test_an_unlike_particle_is_refused(scan_of_several):
-    frames, x, y = scan_of_several
-    with pytest.raises(
-        ValueError, match=rf"^x_px, y_px: got a particle at x_px = {x[8]:g}, .* with those of the others"
-    ):
-        Calibration.from_scan(frames, SCAN_Z_UM, x, y, size=61)
 
 
 @pytest.mark.parametrize("away", [(-9, 0), (6, 8), (0, 0)])

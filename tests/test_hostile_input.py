@@ -210,8 +210,8 @@ def test_from_stacks_that_fit(size, data):
 @given(
     scan=arrays(dims=st.sampled_from([3, 3, 3, 2]), side=st.sampled_from([7, 12, 25, 0])) | odd,
     z_um=depths,
-    x_px=st.floats(0, 12) | st.lists(st.floats(0, 12), max_size=3) | odd,
-    y_px=st.floats(0, 12) | st.lists(st.floats(0, 12), max_size=3) | odd,
+    x_px=st.floats(0, 12) | odd,
+    y_px=st.floats(0, 12) | odd,
     given=some("size", "n_sub", "n", "denoise"),
 )
 def test_from_scan(scan, z_um, x_px, y_px, given):
