@@ -5,6 +5,10 @@ for a smooth background and the sum of their images (`field_images`); what is un
 each by least squares over the whole scan: places, brightnesses and heights of the particles, all at once, with the
 patterns as they are; then the patterns, from what that leaves of the slices. The turns end when nothing is left but
 noise. Nobody needs to say where the particles are: in focus they stand out.
+
+Particles are not quite alike: some are larger, some are two that stick together. The ways in which they differ most
+from the mean pattern (`modes`) are learned as well, with each particle's share of them, so that a particle that is
+measured may differ, too, as far as those of the scan do. Else its size would be taken for its depth, near focus.
 """
 
 from dataclasses import dataclass, field
@@ -16,7 +20,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import shift, uniform_filter, uniform_filter1d
 from scipy.spatial import KDTree
 
 from gdptlab.background import Background
@@ -36,9 +40,9 @@ ALONE_PX = 28.0
 PHOTONS, MISFIT = 0.3, 0.05
 """A pixel's variance is the noise's, and this times its light, and the square of that share of its light."""
 
-RIDGE = 0.2
-"""Holds a pattern's change over the field at nothing where few particles tell. Chosen, between 0.03 and 1, by learning
-from half of a real scan's particles and measuring the other half in its slices."""
+RIDGE = 0.5
+"""Holds a pattern's changes over the field, and the modes, at nothing where few particles tell. Chosen, between 0.05
+and 2, by learning from half of a real scan's particles and measuring the other half in its slices."""
 
 BELIEVED = 1.0
 """Steps by which a particle's height may differ from the focal surface."""
@@ -49,6 +53,13 @@ image is wide it changes slowly, but noise differs from step to step and makes d
 
 EVERY = 3
 """Slices from which places are found: neighbouring ones say much the same of them."""
+
+MODES = 8
+"""Ways in which particles may differ."""
+
+DIFFER, DIFFER_PX = 0.07, 8
+"""Particles may differ where their images are brighter than this share of the brightest, near focus, and so far from
+the middle. Beyond, a mode would rather explain the light of neighbours. Chosen, between 0.05 and 0.15, likewise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +78,8 @@ class FieldCalibration:
         Step at which a particle in the middle of the field is in focus.
     noise : float
         Standard deviation of a pixel of the scan.
+    modes : float32 array (K, N, m, m)
+        As in `FieldImages`; a particle's share of each is 0 on average, with standard deviation 1.
     own_error_um : float64 array (N,)
         How far a particle like those of the scan is off, at each depth, because it is not quite like them.
     beads : DataFrame
@@ -79,6 +92,7 @@ class FieldCalibration:
     surface: NDArray[np.float64]
     middle: float
     noise: float
+    modes: NDArray[np.float32]
     own_error_um: NDArray[np.float64]
     beads: pd.DataFrame
     _plans: dict = field(default_factory=dict, repr=False)
@@ -130,8 +144,12 @@ class FieldCalibration:
             left, weight = learning.left_over()
             learning.learn_patterns(left, weight, first=turn == 0)
             learning.learn_places()
-        left, weight = learning.left_over()
-        learning.learn_patterns(left, weight)
+        learning.begin_modes(learning.left_over()[0])
+        for _ in range(turns):
+            learning.learn_patterns(*learning.left_over())
+            learning.learn_shares()
+            learning.learn_places()
+        learning.learn_patterns(*learning.left_over())
         own = learning.own_error() * abs(steps.mean())
         beads = pd.DataFrame(
             {
@@ -142,7 +160,16 @@ class FieldCalibration:
                 "learned": learning.learned,
             }
         )
-        return cls(learning.patterns, z_um[order], learning.surface, learning.middle, learning.noise, own, beads)
+        return cls(
+            learning.patterns,
+            z_um[order],
+            learning.surface,
+            learning.middle,
+            learning.noise,
+            learning.modes,
+            own,
+            beads,
+        )
 
     @classmethod
     def from_one(cls, calibration: Calibration) -> Self:
@@ -166,6 +193,7 @@ class FieldCalibration:
             np.zeros(4),
             float(peak.argmax()),
             noise_level(calibration.stack),
+            np.zeros((0, *fine.shape), np.float32),
             calibration.own_error[:, 2],
             beads,
         )
@@ -181,7 +209,8 @@ class FieldCalibration:
     @cached_property
     def images(self) -> FieldImages:
         """What draws particles."""
-        return FieldImages(self.patterns, self.surface, self.noise, float(self.beads["brightness"].quantile(0.9)))
+        brightest = float(self.beads["brightness"].quantile(0.9))
+        return FieldImages(self.patterns, self.surface, self.noise, brightest, self.modes)
 
     def pattern(self, x_px: float, y_px: float, shape: tuple[int, int]) -> NDArray[np.float32]:
         """Images (N, n, n) of a particle at a place of frames of `shape`, a pixel apart, in focus at `middle`."""
@@ -262,6 +291,7 @@ class _Learning:
         self.heights[off] = (self._terms @ self.surface)[off]
         m = 2 * FINE * reach + 1
         self.patterns = np.zeros((self._terms.shape[1], len(scan), m, m), np.float32)
+        self.modes = np.zeros((0, len(scan), m, m), np.float32)
         self._behind = Background(self._shape, 4 * reach)
 
     def _fit_surface(self) -> None:
@@ -272,11 +302,13 @@ class _Learning:
             self.surface = np.linalg.lstsq(terms * trust[:, None], heights * trust, rcond=None)[0]
             trust = 1 / np.sqrt(np.maximum(1, np.abs(heights - terms @ self.surface) / 0.3))
 
-    def _slice(self, images: FieldImages, k: int) -> tuple[Columns, NDArray[np.float32], NDArray[np.float32]]:
+    def _slice(
+        self, images: FieldImages, k: int, *, by_mode: bool = False
+    ) -> tuple[Columns, NDArray[np.float32], NDArray[np.float32]]:
         """Columns of the particles in a slice, what they and the background leave of it, and the pixels' weight."""
         places = self.places.copy()
         places[:, 2] = k
-        columns = images.draw(places, self._shape, self.heights)
+        columns = images.draw(places, self._shape, self.heights, by_mode=by_mode)
         light = np.zeros(self._shape, np.float32)
         columns.add_to(light, places[:, 3])
         bright = np.maximum(light, 0)
@@ -285,7 +317,8 @@ class _Learning:
         return columns, left - self._behind.fit(left, weight), weight
 
     def _images(self) -> FieldImages:
-        return FieldImages(self.patterns, self.surface, self.noise, float(np.quantile(self.places[:, 3], 0.9)))
+        brightest = float(np.quantile(self.places[:, 3], 0.9))
+        return FieldImages(self.patterns, self.surface, self.noise, brightest, self.modes)
 
     def left_over(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """What is not explained of all slices, and its weight."""
@@ -315,22 +348,48 @@ class _Learning:
         self.heights = np.clip(self.heights, smooth - BELIEVED, smooth + BELIEVED)
 
     def learn_patterns(self, left: NDArray[np.float32], weight: NDArray[np.float32], first: bool = False) -> None:
-        """Add to the patterns what is left around the particles, node by node regressed on the field's terms.
+        """Add to the patterns, and to the modes, what is left around the particles.
 
-        A pixel counts for the node that is nearest to it. In the `first` turn nobody's neighbours are known yet, and
-        only particles without near ones are used.
+        In the `first` turn nobody's neighbours are known yet, and only particles without near ones are used.
         """
-        chosen, (modes, count, m, _) = self.learned, self.patterns.shape
+        chosen, count = self.learned, len(self._terms.T)
         if first:
             alone = KDTree(self.places[:, :2]).query(self.places[:, :2], k=2)[0][:, 1] > ALONE_PX
-            chosen = chosen & alone if (chosen & alone).sum() >= 2 * modes else chosen
+            chosen = chosen & alone if (chosen & alone).sum() >= 2 * count else chosen
+        change = self._regressed(left, weight, chosen, self._terms, np.arange(len(left)), self._reach)
+        if len(self.modes):
+            near, zone = self._near()
+            shares = np.concatenate([self._terms, self.places[:, 4:]], axis=1)
+            both = self._regressed(left, weight, chosen, shares, near, min(DIFFER_PX, self._reach))
+            change[zone] = both[:count]
+            self.modes[zone] += both[count:]
+            self.modes[zone] = np.einsum(
+                "kl,mlij->mkij", _smoother(len(left), self.middle)[near][:, near], self.modes[zone]
+            )
+        self.patterns = np.einsum("kl,mlij->mkij", _smoother(len(left), self.middle), self.patterns + change)
+
+    def _regressed(
+        self,
+        left: NDArray[np.float32],
+        weight: NDArray[np.float32],
+        chosen: NDArray[np.bool_],
+        shares: NDArray[np.float64],
+        steps: NDArray[np.int64],
+        reach: int,
+    ) -> NDArray[np.float32]:
+        """What is left around the chosen particles at those steps, node by node regressed on their shares (P, M).
+
+        A pixel counts for the node that is nearest to it. Shape is (M, steps, m, m).
+        """
+        shares, count = shares.astype(np.float32), len(self.scan)
+        modes, m = shares.shape[1], 2 * FINE * reach + 1
         upper = np.triu_indices(modes)
-        square, right = np.zeros((len(upper[0]), count, m, m), np.float32), np.zeros_like(self.patterns)
-        steps = np.arange(count)
+        square = np.zeros((len(upper[0]), len(steps), m, m), np.float32)
+        right = np.zeros((modes, len(steps), m, m), np.float32)
         for i in np.flatnonzero(chosen):
-            (y, x, _, light), terms = self.places[i].astype(np.float32), self._terms[i].astype(np.float32)
+            (y, x, _, light), terms = self.places[i, :4].astype(np.float32), shares[i]
             (y0, y1), (x0, x1) = (
-                (max(int(np.ceil(p - self._reach)), 0), min(int(np.floor(p + self._reach)) + 1, n))
+                (max(int(np.ceil(p - reach)), 0), min(int(np.floor(p + reach)) + 1, n))
                 for p, n in zip((y, x), self._shape, strict=True)
             )
             below = int(np.floor(self.heights[i]))
@@ -341,42 +400,112 @@ class _Learning:
             )
             beyond = (steps + below < 0) | (steps + below + 1 > count - 1)  # the ends of the scan, repeated
             trust[beyond] *= 1e-3
-            j, k = (round(FINE * (p0 - p)) + FINE * self._reach for p0, p in ((y0, y), (x0, x)))
+            j, k = (round(FINE * (p0 - p)) + FINE * reach for p0, p in ((y0, y), (x0, x)))
             nodes = np.s_[:, j : j + FINE * (y1 - y0) : FINE, k : k + FINE * (x1 - x0) : FINE]
             for q, (a, b) in enumerate(zip(*upper, strict=True)):
                 square[q][nodes] += trust * (light**2 * terms[a] * terms[b])
             seen *= trust * light
             for a in range(modes):
                 right[a][nodes] += seen * terms[a]
-        matrix = np.empty((count, m, m, modes, modes), np.float32)
+        matrix = np.empty((len(steps), m, m, modes, modes), np.float32)
         for q, (a, b) in enumerate(zip(*upper, strict=True)):
             matrix[..., a, b] = matrix[..., b, a] = square[q]
-        held = square[0] + 0.3 * square[0].mean(axis=(1, 2), keepdims=True) + 1e-6
+        # Of nodes that few meet, by their neighbours; never by all: where light is bright they tell far less.
+        held = uniform_filter(square[0], (1, 5, 5), mode="nearest") + 1e-9
         for a in range(modes):
             matrix[..., a, a] += (RIDGE if a else 1e-3) * held
-        new = np.linalg.solve(matrix, np.moveaxis(right, 0, -1)[..., None])[..., 0]
-        self.patterns += np.moveaxis(new, -1, 0)
-        self.patterns = np.einsum("kl,mlij->mkij", _smoother(count, self.middle), self.patterns).astype(np.float32)
+        return np.moveaxis(np.linalg.solve(matrix, np.moveaxis(right, 0, -1)[..., None])[..., 0], -1, 0)
+
+    def _near(self) -> tuple[NDArray[np.int64], tuple[slice, ...]]:
+        """Steps at which particles may differ, and where in the patterns that is."""
+        peak = self.patterns[0].max(axis=(1, 2))
+        steps = np.flatnonzero(peak > DIFFER * peak.max())
+        n = min(DIFFER_PX, self._reach)
+        nodes = slice(FINE * (self._reach - n), FINE * (self._reach + n) + 1)
+        return np.arange(steps[0], steps[-1] + 1), np.s_[:, steps[0] : steps[-1] + 1, nodes, nodes]
+
+    def begin_modes(self, left: NDArray[np.float32]) -> None:
+        """Shares of the modes, from the principal components of what is left around particles near focus."""
+        (near, zone), n, margin = self._near(), min(DIFFER_PX, self._reach), 3
+        around = np.pad(left, ((0, 0), (n + margin,) * 2, (n + margin,) * 2))
+        rest = []
+        for (y, x, _, light), height in zip(self.places[:, :4], self.heights, strict=True):
+            low = np.clip(near + int(np.floor(height)), 0, len(left) - 2)
+            part = height % 1
+            row, column = (int(np.clip(round(p), 0, size - 1)) for p, size in zip((y, x), self._shape, strict=True))
+            cut = np.s_[:, row : row + 2 * (n + margin) + 1, column : column + 2 * (n + margin) + 1]
+            image = ((1 - part) * around[low] + part * around[low + 1])[cut] / light
+            image = shift(image, (0, row - y, column - x), order=3)[:, margin:-margin, margin:-margin]
+            rest.append(image.ravel())
+        light = np.maximum(self.patterns[zone][0, :, ::FINE, ::FINE], 0)
+        rest = np.array(rest) / np.sqrt(self.noise**2 + PHOTONS * light).ravel()
+        size = np.sqrt((rest**2).mean(axis=1))
+        rest *= np.minimum(1, np.median(size[self.learned]) / size)[:, None]  # clusters, and what lies beside them
+        count = min(MODES, self.learned.sum() // 4)
+        self._set_shares(np.linalg.svd(rest, full_matrices=False)[0][:, :count])
+
+    def _set_shares(self, shares: NDArray[np.float64]) -> None:
+        """Shares of mean 0 and standard deviation 1, which tell nothing that the place in the field tells."""
+        told = np.linalg.lstsq(self._terms[self.learned], shares[self.learned], rcond=None)[0]
+        shares = shares - self._terms @ told
+        values, vectors = np.linalg.eigh(np.cov(shares[self.learned].T))
+        root = vectors * np.sqrt(values) @ vectors.T
+        self.places = np.concatenate([self.places[:, :4], shares @ np.linalg.inv(root)], axis=1)
+        if len(self.modes):
+            self.patterns += np.einsum("ak,knij->anij", told.astype(np.float32), self.modes)
+            self.modes = np.einsum("kl,lnij->knij", root, self.modes).astype(np.float32)
+        else:
+            self.modes = np.zeros((shares.shape[1], *self.patterns.shape[1:]), np.float32)
+
+    def learn_shares(self) -> None:
+        """Shares of the modes that fit best, each particle's for itself, the others and the patterns as they are."""
+        images, matrix, right = self._images(), 0, 0
+        for k in range(0, len(self.scan), EVERY):
+            one, other = _each_alone(*self._slice(images, k, by_mode=True))
+            matrix, right = matrix + one[:, 4:, 4:], right + other[:, 4:]
+        right -= self.places[:, 4:]
+        matrix += np.eye(len(self.modes))
+        self._set_shares(self.places[:, 4:] + np.linalg.solve(matrix, right[..., None])[..., 0])
 
     def own_error(self) -> NDArray[np.float64]:
         """Scatter of the depths (steps) that single slices give for their particles, (N,).
 
-        It is that of particles from which the patterns were learned; M terms learned from P particles, a quarter of
-        whose pixels meet a node, make it smaller than for others by a factor 1 - 4 M / P.
+        It is that of particles from which the patterns were learned; M terms and modes learned from P particles, a
+        quarter of whose pixels meet a node, make it smaller than for others by a factor 1 - 4 M / P.
         """
         images, slices, scatter = self._images(), np.arange(0, len(self.scan), 2 * EVERY), []
         smooth = self._terms @ self.surface
         for k in slices:
-            columns, left, weight = self._slice(images, k)
+            columns, left, weight = self._slice(images, k, by_mode=True)
             n = 4 * len(self.places)
             matrix = np.zeros((n, n))
             _add_band(matrix, columns.matrix(weight))
             matrix[np.diag_indices(n)] += 1e-6 * np.trace(matrix) / n
             change = solve(matrix, columns.gradient(left, weight)[0].ravel(), lower=True, assume_a="pos")
-            off = change.reshape(-1, 4)[:, 2] + smooth - self.heights
-            scatter.append(np.median(np.abs(off[self.learned])) / 0.6745)
-        share = min(FINE**2 * len(self.patterns) / self.learned.sum(), 0.5)
-        return np.interp(np.arange(len(self.scan)), slices, uniform_filter1d(scatter, 5, mode="nearest")) / (1 - share)
+            # Beside others, alike; and alone, but differing, of which nothing is known beforehand.
+            matrix, right = _each_alone(columns, left, weight)
+            differ = np.arange(4, 4 + len(self.modes))
+            matrix[:, differ, differ] += 1
+            right[:, 4:] -= self.places[:, 4:]
+            alone = np.linalg.solve(matrix + 1e-9 * np.eye(4 + len(self.modes)), right[..., None])[:, 2, 0]
+            off = np.abs(np.stack([change.reshape(-1, 4)[:, 2], alone]) + smooth - self.heights)[:, self.learned]
+            count = len(self.patterns) + len(self.modes) * self.modes[:, k].any()
+            share = min(FINE**2 * count / self.learned.sum(), 0.5)
+            scatter.append(np.median(off, axis=1).max() / 0.6745 / (1 - share))
+        return np.interp(np.arange(len(self.scan)), slices, uniform_filter1d(scatter, 5, mode="nearest"))
+
+
+def _each_alone(
+    columns: Columns, left: NDArray[np.float32], weight: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Matrix (P, C, C) and right-hand side (P, C) of the least-squares problem of each particle for itself."""
+    count, unknown = len(columns.boxes), len(columns.values)
+    matrix, right = np.zeros((count, unknown, unknown)), np.zeros((count, unknown))
+    for i, (y0, y1, x0, x1) in enumerate(columns.boxes):
+        own = columns.values[:, columns.starts[i] : columns.starts[i + 1]]
+        trusted = own * weight[y0:y1, x0:x1].ravel()
+        matrix[i], right[i] = trusted @ own.T, trusted @ left[y0:y1, x0:x1].ravel()
+    return matrix, right
 
 
 def _smoother(count: int, middle: float) -> NDArray[np.float64]:

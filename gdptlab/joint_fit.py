@@ -28,8 +28,8 @@ class JointFit:
 
     Attributes
     ----------
-    places : float64 array (P, 4)
-        y, x (px), step along the stack, brightness.
+    places : float64 array (P, 4 or more)
+        y, x (px), step along the stack, brightness; what else they were given with.
     residual, light, behind : float32 arrays (rows, columns)
         What is not explained; what the particles explain; the background.
     explains : float64 array (P,)
@@ -91,8 +91,8 @@ def fitted(
     ----------
     shapes : ParticleImages
     frame : float32 array (rows, columns)
-    places : float64 array (P, 4)
-        y, x (px), step along the stack, brightness.
+    places : float64 array (P, 4 or more)
+        y, x (px), step along the stack, brightness; what else `shapes` draws with, which stays as it is.
     weight : float32 array (rows, columns)
         One over the variance of each pixel.
     brightness, spread : float
@@ -131,7 +131,7 @@ def fitted(
         if surface is not None and share.max(initial=0) <= 1:  # it belongs to the whole step, not to one cut short
             behind = behind + surface.surface(shift)
         change = change.reshape(-1, 4) / np.maximum(share.max(axis=1, keepdims=True), 1)
-        places[order] += change
+        places[order, :4] += change
         places[:, 2] = np.clip(places[:, 2], 0, shapes.count - 1)
         places[:, 3] = np.clip(places[:, 3], 0.05 * brightness, 20 * brightness)
         if not near:

@@ -139,7 +139,7 @@ class _Search:
         self._surface = Background(frame.shape, 4 * calibration.reach_px)
         self.noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame))) or 1.0
         self.noise_and_photons, self.misfit = (self.noise**2, PHOTONS), MISFIT
-        self.places = np.zeros((0, 4))
+        self.places = np.zeros((0, 4 + self._images.modes))
         self.fit: JointFit = self._fitted(0)
 
     def find(self) -> None:
@@ -160,9 +160,9 @@ class _Search:
     def table(self) -> pd.DataFrame:
         """What `locate_over_field` returns."""
         z_um, steps = self.calibration.z_um, np.arange(len(self.calibration))
-        other, log_ratio = self._compare(ASTRAY[1:-1])
-        y, x, step, brightness = self.places.T
-        std = self.fit.std * (1, 1, abs(z_um[1] - z_um[0]))
+        _, other, log_ratio, more = self._compare(ASTRAY[1:-1])
+        y, x, step, brightness = self.places.T[:4]
+        std = np.sqrt(self.fit.std**2 + more) * (1, 1, abs(z_um[1] - z_um[0]))
         table = pd.DataFrame(
             {
                 "x_px": x,
@@ -233,7 +233,7 @@ class _Search:
         new = new[keep]
         if len(self.places) and len(new):
             new = new[KDTree(self.places[:, :2]).query(new[:, :2])[0] > 2]
-        return new
+        return np.pad(new, ((0, 0), (0, self._images.modes)))
 
     def _drop(self) -> None:
         """Without those that explain too little, and those far outside."""
@@ -243,55 +243,80 @@ class _Search:
         self.places = self.places[stays]
         self.fit = self._fitted(1)
 
-    def _compare(self, astray: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The best other place of each particle (P, 4), and the log-likelihood by which it is worse (P,)."""
+    def _compare(
+        self, astray: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Each particle fitted alone, from where it is and from the other side of focus.
+
+        Returns
+        -------
+        own, other : arrays (P, 4 + K)
+            Where it gets from where it is; the best place at another depth.
+        log_ratio : array (P,)
+            Log-likelihood by which the other is worse.
+        more : array (P, 3)
+            What the modes' being unknown adds to the variance of y, x and step.
+        """
         places, count = self.places, len(self.places)
         if not count:
-            return places, np.zeros(0)
+            return places, places, np.zeros(0), np.zeros((0, 3))
         height = field_terms(places[:, 1], places[:, 0], self.frame.shape) @ self.calibration.surface
         mirror = 2 * (self.calibration.middle + height) - places[:, 2]
         start = np.concatenate([places[:, 2:3], mirror[:, None] + astray], axis=1)
         trials = np.repeat(places, start.shape[1], axis=0)
         trials[:, 2] = np.clip(start.ravel(), 0, len(self.calibration) - 1)
         owner = np.repeat(np.arange(count), start.shape[1])
-        trials, gain = self._climbed(trials, owner)
-        trials, gain = trials.reshape(count, -1, 4), gain.reshape(count, -1)
+        trials, gain, more = (a.reshape(count, start.shape[1], -1) for a in self._climbed(trials, owner))
+        gain = gain[..., 0]
         step_um = abs(self.calibration.z_um[1] - self.calibration.z_um[0])
         same = np.abs(trials[:, :, 2] - trials[:, :1, 2]) * step_um < APART_UM
         same[same.all(axis=1), 1] = False  # one depth only: it is both
         best = np.where(same, -np.inf, gain).argmax(axis=1)
         rows = np.arange(count)
         log_ratio = np.where(same, gain, -np.inf).max(axis=1) - np.where(same, -np.inf, gain)[rows, best]
-        return trials[rows, best], log_ratio
+        return trials[:, 0], trials[rows, best], log_ratio, more[:, 0]
 
     def _other_sides(self, astray: NDArray[np.float64]) -> None:
-        """Move particles to the other side of focus where that is likelier."""
-        other, log_ratio = self._compare(astray)
-        self.places = np.where(log_ratio[:, None] < 0, other, self.places)
+        """Move particles to the other side of focus where that is likelier, and find how they differ."""
+        own, other, log_ratio, _ = self._compare(astray)
+        self.places = np.where(log_ratio[:, None] < 0, other, own)
 
     def _climbed(
         self, trials: NDArray[np.float64], owner: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Fit particles alone, the others as they are, from `trials` (n, 4), each in the stead of one `owner`."""
-        fit, count = self.fit, len(self._images.reach)
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Fit particles alone, the others as they are, from `trials` (n, 4 + K), each in the stead of one `owner`.
+
+        Returns
+        -------
+        trials
+        gain : array (n,)
+            In log-likelihood, over the frame without the particle.
+        more : array (n, 3)
+            As from `_compare`.
+        """
+        fit, count, size = self.fit, len(self._images.reach), trials.shape[1]
         own = self._images.draw(self.places, self.frame.shape)
+        upper, diagonal = np.triu_indices(size), np.arange(size)
         for step in range(CLIMB + 1):
-            columns = self._images.draw(trials, self.frame.shape)
-            sums = np.zeros((len(trials), 15))
+            columns = self._images.draw(trials, self.frame.shape, by_mode=True)
+            sums = np.zeros((len(trials), len(upper[0]) + size + 1))
             _local(
                 fit.residual, fit.light, self.places[:, 3], owner, trials[:, 3], self.noise_and_photons,
                 own.boxes, own.starts, own.values, columns.boxes, columns.starts, columns.values, sums,
             )  # fmt: skip
-            if step == CLIMB:
-                return trials, sums[:, 14]
-            matrix = np.empty((len(trials), 4, 4))
-            upper = np.triu_indices(4)
-            matrix[:, upper[0], upper[1]] = matrix[:, upper[1], upper[0]] = sums[:, :10]
-            diagonal = np.arange(4)
+            matrix = np.empty((len(trials), size, size))
+            matrix[:, upper[0], upper[1]] = matrix[:, upper[1], upper[0]] = sums[:, : len(upper[0])]
             matrix[:, diagonal, diagonal] = 1.01 * matrix[:, diagonal, diagonal] + 1e-9
-            change = np.linalg.solve(matrix, sums[:, 10:14, None])[..., 0]
+            matrix[:, diagonal[4:], diagonal[4:]] += 1
+            if step == CLIMB:
+                variance = [np.diagonal(np.linalg.inv(m), axis1=1, axis2=2)[:, :3] for m in (matrix, matrix[:, :4, :4])]
+                gain = sums[:, -1] - (trials[:, 4:] ** 2).sum(axis=1) / 2
+                return trials, gain, np.maximum(variance[0] - variance[1], 0)
+            pull = sums[:, len(upper[0]) : -1]
+            pull[:, 4:] -= trials[:, 4:]
+            change = np.linalg.solve(matrix, pull[..., None])[..., 0]
             longest = np.stack([np.full(len(trials), s) for s in (1, 1, 3)] + [0.5 * trials[:, 3]], axis=1)
-            change /= np.maximum((np.abs(change) / longest).max(axis=1, keepdims=True), 1)
+            change /= np.maximum((np.abs(change[:, :4]) / longest).max(axis=1, keepdims=True), 1)
             trials = trials + change
             trials[:, 2] = np.clip(trials[:, 2], 0, count - 1)
             trials[:, 3] = np.maximum(trials[:, 3], 0.02)
@@ -302,40 +327,48 @@ class _Search:
 def _local(
     left, light, brightness, owner, trial, noise_and_photons, boxes, starts, values, t_boxes, t_starts, t_values, sums
 ):  # pragma: no cover
-    """Sums over the pixels of each trial: upper triangle of its matrix (10), gradient (4), gain in log-likelihood.
+    """Sums over the pixels of each trial: upper triangle of its matrix, gradient, gain in log-likelihood.
 
     A trial stands in the stead of its owner, whose light goes back into what is left. Each pixel's variance is that
     of the light of all others and of the trial.
     """
     level, photons = np.float32(noise_and_photons[0]), np.float32(noise_and_photons[1])
-    zero = np.float32(0)
-    column = np.empty(4, np.float32)
+    zero, size = np.float32(0), len(t_values)
+    first = size * (size + 1) // 2  # of the gradient in `sums`
+    trust, pull, trusted = np.empty((3, left.shape[1]), np.float32)
     for i in range(len(t_boxes)):
         o, total = owner[i], 0.0
         mine, bright = np.float32(brightness[o]), np.float32(trial[i])
         y0, y1, x0, x1 = t_boxes[i]
         a0, a1, b0, b1 = boxes[o]
+        used = size if np.any(t_values[4:, t_starts[i] : t_starts[i + 1]]) else 4
         for r in range(y0, y1):
+            s, inside = t_starts[i] + (r - y0) * (x1 - x0), a0 <= r < a1
             for c in range(x0, x1):
-                s = t_starts[i] + (r - y0) * (x1 - x0) + c - x0
                 seen, others = left[r, c], light[r, c]
-                if a0 <= r < a1 and b0 <= c < b1:
+                if inside and b0 <= c < b1:
                     back = mine * values[3, starts[o] + (r - a0) * (b1 - b0) + c - b0]
                     seen += back
                     others -= back
                 others = max(others, zero)
                 before = level + photons * others
-                image = bright * t_values[3, s]
+                image = bright * t_values[3, s + c - x0]
                 others += max(image, zero)
                 after = level + photons * others
                 rest = seen - image
                 total += seen * seen / before - rest * rest / after + np.log(before / after)
-                q = 0
-                for a in range(4):
-                    column[a] = t_values[a, s]
-                for a in range(4):
-                    for b in range(a, 4):
-                        sums[i, q] += column[a] * column[b] / after
-                        q += 1
-                    sums[i, 10 + a] += column[a] * rest / after
-        sums[i, 14] = total / 2
+                trust[c - x0], pull[c - x0] = 1 / after, rest / after
+            n = x1 - x0
+            for a in range(used):
+                column, product = t_values[a, s:], zero
+                for c in range(n):
+                    trusted[c] = trust[c] * column[c]
+                    product += pull[c] * column[c]
+                sums[i, first + a] += product
+                q = a * (2 * size - a - 1) // 2
+                for b in range(a, used):
+                    other, product = t_values[b, s:], zero
+                    for c in range(n):
+                        product += trusted[c] * other[c]
+                    sums[i, q + b] += product
+        sums[i, -1] = total / 2
