@@ -33,7 +33,7 @@ from gdptlab.check import positive, whole
 from gdptlab.files import cache_folder, written_whole
 from gdptlab.film import Film
 
-VERSION = 5
+VERSION = 6
 """Part of every cache key: to be raised when films, or what an evaluator calls, give other results."""
 
 _BLOCK = 25  # frames per job: long against what it costs to hand a job to a worker
