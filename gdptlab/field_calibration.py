@@ -119,7 +119,7 @@ class FieldCalibration:
         reach_px : int
             How far the widest image reaches from its middle.
         turns : int
-            Of solving for places and for patterns.
+            Of solving for places and for patterns; as many again with modes.
         learn_from : array of bool, optional
             Which of the particles, in the order of `find_beads`, the patterns and the focal surface are learned
             from (all). The others' light is only accounted for, so that they can serve to test the calibration.
@@ -238,7 +238,7 @@ def find_beads(scan: ArrayLike) -> pd.DataFrame:
         step; `light`, the sum of its pixels there, less its surroundings.
     """
     scan = real_array("scan", scan, 3)
-    noise = noise_level(scan[:: max(len(scan) // 10, 1)])
+    noise = _noise(scan)
     sharp = np.stack([cv2.GaussianBlur(f, (0, 0), 0.8) - cv2.GaussianBlur(f, (0, 0), 2.5) for f in scan])
     highest = sharp.max(axis=0)
     y, x = np.nonzero((highest == cv2.dilate(highest, np.ones((5, 5), np.uint8))) & (highest > STANDS_OUT * noise))
@@ -267,11 +267,16 @@ def find_beads(scan: ArrayLike) -> pd.DataFrame:
     return table.sort_values("x_px", ignore_index=True)
 
 
+def _noise(scan: NDArray[np.float32]) -> float:
+    """Standard deviation of a pixel of the scan; above 0 even if it was computed without noise."""
+    return max(noise_level(scan[:: max(len(scan) // 10, 1)]), 1e-4 * float(np.ptp(scan))) or 1.0
+
+
 class _Learning:
     """A scan (N, rows, columns) and all that is known of it so far."""
 
     def __init__(self, scan: NDArray[np.float32], reach: int, learn_from: ArrayLike | None) -> None:
-        self.scan, self.noise, self._reach = scan, noise_level(scan[:: max(len(scan) // 10, 1)]), reach
+        self.scan, self.noise, self._reach = scan, _noise(scan), reach
         found = find_beads(scan)
         self.learned = np.ones(len(found), bool) if learn_from is None else np.asarray(learn_from)
         if self.learned.shape != (len(found),) or self.learned.dtype != bool:
@@ -449,7 +454,7 @@ class _Learning:
         told = np.linalg.lstsq(self._terms[self.learned], shares[self.learned], rcond=None)[0]
         shares = shares - self._terms @ told
         values, vectors = np.linalg.eigh(np.cov(shares[self.learned].T))
-        root = vectors * np.sqrt(values) @ vectors.T
+        root = vectors * np.sqrt(np.maximum(values, 1e-6)) @ vectors.T
         self.places = np.concatenate([self.places[:, :4], shares @ np.linalg.inv(root)], axis=1)
         if len(self.modes):
             self.patterns += np.einsum("ak,knij->anij", told.astype(np.float32), self.modes)

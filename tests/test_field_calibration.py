@@ -293,6 +293,16 @@ def test_derivative_by_a_mode_is_its_image(of_unlike):
     np.testing.assert_array_equal(images.draw(place[:, :4], shape).values, by_mode.values[:4])
 
 
+def test_a_scan_without_noise():
+    """Computed images may have none; few beads have fewer modes."""
+    x, y, brightness = beads_of(1, 12)
+    scan = np.stack([100 + light(x, y, np.full(12, z), brightness) for z in Z_UM])
+    calibration = FieldCalibration.from_scan(scan, Z_UM, reach_px=REACH, turns=1)
+    assert calibration.noise > 0 and len(calibration.modes) == 3
+    for part in (calibration.patterns, calibration.modes, calibration.own_error_um, calibration.surface):
+        assert np.isfinite(part).all()
+
+
 # -------------------- refusals
 
 
