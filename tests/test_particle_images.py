@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from conftest import SIZE_PX, Z_UM, table
+from scipy.interpolate import BSpline
 
 from gdptlab.imagetypes import Camera
-from gdptlab.particle_images import ParticleImages
+from gdptlab.particle_images import ParticleImages, along_z
 
 HALF = SIZE_PX // 2
 NOISE = Camera().read_noise
@@ -193,3 +194,13 @@ def test_no_particles(shapes):
     assert gradient.shape == (0, 4) and chi2.shape == (0,) and columns.matrix(ones).shape[1] == 0
     columns.add_to(ones, np.zeros(0))
     assert (ones == 1).all()
+
+
+@pytest.mark.parametrize(("count", "degree"), [(12, 3), (5, 3), (4, 1), (3, 1)])
+def test_spline_along_z_follows_a_cubic_to_its_ends(count, degree):
+    """Of few images, a line."""
+    steps, fine = np.arange(count), np.linspace(0, count - 1, 50)
+    cubic = np.polynomial.Polynomial([3.0, -2.0, 0.5, 0.1][: degree + 1])
+    coefficients = along_z(cubic(steps)[:, None])[:, 0]
+    assert len(coefficients) == count + 2
+    np.testing.assert_allclose(BSpline(np.arange(count + 6) - 3.0, coefficients, 3)(fine), cubic(fine), atol=1e-9)
