@@ -4,7 +4,8 @@ Particles are found one after the other by a matched filter in what the others l
 `overlap`, but nothing is known of their brightness, and each is drawn with the pattern of its place. The joint fit
 climbs to the nearest depth only. Without astigmatism there are two, one on either side of focus, so that each
 particle is also fitted from the mirror image of its depth, with the others as they are, and goes where the
-likelihood is higher. The lower of the two is reported as well.
+likelihood is higher. The lower of the two is reported as well. In these fits of single particles each may also differ
+from the pattern as those of the scan do; the joint fits in between keep what was found.
 """
 
 import threading
