@@ -122,7 +122,8 @@ class FieldCalibration:
             Of solving for places and for patterns; as many again with modes.
         learn_from : array of bool, optional
             Which of the particles, in the order of `find_beads`, the patterns and the focal surface are learned
-            from (all). The others' light is only accounted for, so that they can serve to test the calibration.
+            from (all, but for those on the border). The others' light is only accounted for, so that they can serve
+            to test the calibration.
 
         Raises
         ------
@@ -283,6 +284,10 @@ class _Learning:
             raise ValueError(
                 f"learn_from: got shape {self.learned.shape}, needed is a bool for each of {len(found)} beads"
             )
+        # Of a particle on the border half an image is seen, which would make the halves of the patterns differ.
+        places = found[["y_px", "x_px"]].to_numpy()
+        inside = np.minimum(places, np.array(scan.shape[1:]) - 1 - places).min(axis=1)
+        self.learned = self.learned & (inside > reach / 2)
         if self.learned.sum() < 10:
             raise ValueError(f"scan: got {self.learned.sum()} particles to learn from, needed are 10 or more")
         self.places = np.stack([found["y_px"], found["x_px"], 0 * found["x_px"], found["light"]], axis=1)
