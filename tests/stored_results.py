@@ -1,0 +1,124 @@
+"""Tables that guard a rebuild: what the package measured when they were stored (`test_stored_results.py` compares).
+
+``python tests/stored_results.py`` stores them anew: only for a change that is meant to alter a number, in a commit of
+its own that says why. Beside the tables, ``made_on.json`` names the versions and the processor that made them.
+"""
+
+import json
+import platform
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from llvmlite import binding
+
+from gdptlab import Calibration, batch, datasets
+from gdptlab.autocalibrate import calibrate
+from gdptlab.channel import Acoustics, Focusing
+from gdptlab.field_calibration import FieldCalibration
+from gdptlab.film import Film
+from gdptlab.locate import locate
+from gdptlab.over_field import locate_over_field
+from gdptlab.replay import Method, errors, sweep
+from gdptlab.tracks import link, velocities
+
+STORED = Path(__file__).parent / "stored"
+IMAGE_TYPES = ("fluorescent", "brightfield", "disturbed")
+
+
+def film(image_type: str = "fluorescent", seconds: float = 1.0) -> Film:
+    """A short film in which the sound is strong."""
+    focusing = Focusing(acoustics=Acoustics(energy_density_J_m3=6.0))
+    return Film.seeded(3, focusing=focusing, mean_in_view=40.0, duration_s=seconds, image_type=image_type)
+
+
+def sample_calibration(image_type: str) -> Calibration:
+    """Calibration with a stack in `data/`."""
+    sample = datasets.sample(image_type)
+    return Calibration.from_stack(sample.stack, sample.z_um)
+
+
+def correlation(image_type: str, refine: bool) -> pd.DataFrame:
+    """Frames in `data/`, by correlation."""
+    frames = datasets.sample(image_type).frames
+    return batch(frames[:2], sample_calibration(image_type), refine=refine, progress=False)
+
+
+def joint(image_type: str) -> pd.DataFrame:
+    """Two successive frames: the second begins with the first."""
+    frames = film(image_type)
+    return batch([frames[10], frames[11]], sample_calibration(image_type), method="joint", progress=False)
+
+
+def over_field() -> pd.DataFrame:
+    """A frame in `data/`, fitted with amplitudes free."""
+    calibration = FieldCalibration.from_one(sample_calibration("fluorescent"))
+    return locate_over_field(datasets.sample("fluorescent").frames[0], calibration)
+
+
+def replayed() -> pd.DataFrame:
+    """Errors of the trigger times of one film, refined and not."""
+    calibration = sample_calibration("fluorescent")
+    methods = [
+        Method(evaluator=locate, calibration=calibration, settings={"refine": refine}, label={"refine": refine})
+        for refine in (True, False)
+    ]
+    table = sweep([film(seconds=4.0)], methods, every=5, cache=False, progress=False)
+    return errors(table, [0.04, 0.3, 1.0], phases=3)
+
+
+def tracked() -> pd.DataFrame:
+    """Velocities of the particles of a film."""
+    frames = film()
+    table = batch(list(frames), sample_calibration("fluorescent"), method="joint", progress=False)
+    tracks = link(frames.to_channel(table), frames.trajectories.focusing.channel, frames.frame_rate_hz)
+    return velocities(tracks, frames.frame_rate_hz)
+
+
+def beads_correlation() -> pd.DataFrame:
+    """Real beads, calibrated with those that stand alone, by correlation."""
+    beads = datasets.planar_beads()
+    return batch(beads.frames[[2, 8]], calibrate(beads.scan, beads.z_um).calibration, progress=False)
+
+
+def beads_over_field() -> pd.DataFrame:
+    """A quarter of the field of the real beads, calibrated with all beads in it."""
+    beads = datasets.planar_beads()
+    calibration = FieldCalibration.from_scan(beads.scan[::2, :288, :288], beads.z_um[::2], turns=1)
+    return locate_over_field(beads.frames[8, :288, :288], calibration)
+
+
+TABLES: dict[str, Callable[[], pd.DataFrame]] = {
+    **{f"refined-{t}": lambda t=t: correlation(t, refine=True) for t in IMAGE_TYPES},
+    **{f"unrefined-{t}": lambda t=t: correlation(t, refine=False) for t in IMAGE_TYPES},
+    **{f"joint-{t}": lambda t=t: joint(t) for t in IMAGE_TYPES},
+    "over-field": over_field,
+    "replay-errors": replayed,
+    "velocities": tracked,
+    "beads-correlation": beads_correlation,
+    "beads-over-field": beads_over_field,
+}
+"""What is stored, by name; those of the beads need other people's images."""
+
+
+def made_here() -> dict[str, str]:
+    """What the last digits depend on: compilers and libraries, and the processor that they compile for."""
+    names = ("numpy", "scipy", "numba", "opencv-python-headless", "scikit-image", "trackpy")
+    processor = f"{platform.machine()} {binding.get_host_cpu_name()}"
+    return {name: metadata.version(name) for name in names} | {"processor": processor}
+
+
+def main() -> None:
+    """Store all tables."""
+    STORED.mkdir(exist_ok=True)
+    for name, compute in TABLES.items():
+        compute().to_csv(STORED / f"{name}.csv", index=False, float_format="%.10g")
+        print(name, flush=True)
+    (STORED / "made_on.json").write_text(json.dumps(made_here(), indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    np.seterr(all="raise", under="ignore")
+    main()

@@ -1,0 +1,48 @@
+"""Results are those that were stored (`stored_results.py` says what, and how to store them anew)."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from stored_results import STORED, TABLES, made_here
+
+from gdptlab import datasets
+
+EXACT = {"_px": 1e-6, "_um": 1e-5, "": 1e-5}
+"""Largest difference, by the unit at the end of a column's name, on the processor and with the versions stored."""
+
+ELSEWHERE = {"_px": 2e-3, "_um": 2e-2, "": 2e-2}
+"""On others, whose compiled sums round in another order, which the steps of a fit enlarge."""
+
+
+def tolerance(column: str, allowed: dict[str, float]) -> float:
+    return next(value for unit, value in allowed.items() if column.endswith(unit))
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_as_stored(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if name.startswith("beads"):
+        try:
+            datasets.planar_beads()
+        except FileNotFoundError as error:
+            pytest.skip(str(error))
+    stored, found = pd.read_csv(STORED / f"{name}.csv"), TABLES[name]()
+    same = json.loads((STORED / "made_on.json").read_text()) == made_here()
+    allowed = EXACT if same else ELSEWHERE
+    assert list(found) == list(stored)
+    if not same:  # a particle at the limit may come or go; the others are compared
+        assert abs(len(found) - len(stored)) <= 0.02 * len(stored)
+        if len(found) != len(stored):
+            pytest.skip(f"{len(found)} rows where {len(stored)} were stored on another processor")
+    assert len(found) == len(stored)
+    for column in stored:
+        if stored[column].dtype.kind not in "fi":
+            assert (found[column].to_numpy() == stored[column].to_numpy()).all(), column
+            continue
+        here, there = (t[column].to_numpy(dtype=float) for t in (found, stored))
+        off = np.abs(here - there)
+        if not column.endswith(("_px", "_um")):  # of numbers that may be large, a fraction
+            off /= np.maximum(np.abs(there), 1)
+        assert np.nanmax(off, initial=0) <= tolerance(column, allowed), column
+        assert (np.isnan(found[column]) == np.isnan(stored[column])).all(), column
