@@ -14,7 +14,7 @@ import pandas as pd
 from nbclient import NotebookClient
 from tqdm import tqdm
 
-from gdptlab.files import written_whole
+from gdptlab._files import written_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -5,46 +5,31 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 """
 
 import os
-import threading
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from numbers import Integral
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Any, Self
 
 import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_smoothing_spline
-from scipy.ndimage import median, uniform_filter1d
-from scipy.ndimage import shift as shift_image
-from skimage.registration import phase_cross_correlation
+from scipy.ndimage import uniform_filter1d
 
-from gdptlab.check import flag, positive, real_array, whole
-from gdptlab.cores import on_one_core
+from gdptlab._checks import depths, flag, positive, real_array, whole
+from gdptlab._compiled import on_one_core
+from gdptlab._files import written_whole
+from gdptlab._plans import planned
 from gdptlab.correlation import Correlator, normalised
 from gdptlab.denoising import denoised, noise_level
-from gdptlab.displacement import Displacement
-from gdptlab.files import written_whole
-
-Plan = TypeVar("Plan")
+from gdptlab.refinement import Displacement
 
 VERSION = 1
 """Of the file format of `Calibration.save`."""
 
-LARGEST = 121
-"""Rows and columns, px, beyond which no size is chosen for a template unasked."""
-
 REPEATS = 4
 """Of making the calibration again, to see what noise does to it."""
-
-RECENTRED = 4
-"""How often, at most, a particle is cut out anew about the centre that was found."""
-
-STANDS_OUT = 4.0
-"""Height of a particle, over the noise of a pixel, from which on it is one."""
 
 LOSSLESS = 0.98
 """Templates that keep this correlation with themselves at half resolution are searched for there."""
@@ -52,7 +37,7 @@ LOSSLESS = 0.98
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Calibration stack, templates, subset and map. Made by `from_stack`, `from_scan` or `load`.
+    """Calibration stack, templates, subset and map. Made by `from_stack`, `from_bead`, `from_scan` or `load`.
 
     Attributes
     ----------
@@ -64,13 +49,15 @@ class Calibration:
         Indices of the stack images that frames are correlated with.
     templates : float32 array (N, n, n)
         The stack, denoised, each image with mean 0 and norm 1.
+    report : ScanReport, optional
+        How `from_scan` came to this calibration.
     """
 
     stack: NDArray[np.float32]
     z_um: NDArray[np.float64]
     subset: NDArray[np.int64]
     templates: NDArray[np.float32]
-    _plans: dict = field(default_factory=dict, repr=False)
+    report: Any = None
 
     @classmethod
     @on_one_core
@@ -106,7 +93,7 @@ class Calibration:
             If the stack or z_um are not of that form, hold NaN, or an image is constant; if n or n_sub is out
             of range.
         """
-        stack, z_um = real_array("stack", stack, 3), _depths(z_um)
+        stack, z_um = real_array("stack", stack, 3), depths("z_um", z_um)
         if stack.shape[1] != stack.shape[2] or stack.shape[1] % 2 == 0:
             raise ValueError(f"stack: got images of {stack.shape[1:]} px, allowed are square ones of odd size")
         if len(stack) < 3:
@@ -137,11 +124,10 @@ class Calibration:
             If it is no such number.
         """
         subset = _middles(len(self), whole("n_sub", n_sub, 2, len(self)))
-        return replace(self, subset=subset, _plans={})
+        return replace(self, subset=subset)
 
     @classmethod
-    @on_one_core
-    def from_scan(
+    def from_bead(
         cls,
         scan: ArrayLike,
         z_um: ArrayLike,
@@ -155,8 +141,8 @@ class Calibration:
     ) -> Self:
         """Calibrate with one particle of a scan of full frames.
 
-        The particle's centre is found in every slice as the point about which its image is symmetric (under
-        half a turn), made smooth over z, and every slice is moved so that it lies on the middle pixel.
+        The particle's centre is found in every slice as the point about which its image is symmetric under half a
+        turn. The centres are made smooth over z, and every slice is moved so that the centre lies on the middle pixel.
 
         Parameters
         ----------
@@ -175,57 +161,63 @@ class Calibration:
         ------
         TypeError, ValueError
             As `from_stack`; also if the particle is nearer to the border than half a template, or nothing at that
-            place stands out of the noise.
+            position stands out of the noise.
         """
-        scan, z_um = real_array("scan", scan, 3), _depths(z_um)
-        if len(z_um) != len(scan):
-            raise ValueError(f"z_um: got {len(z_um)} depths, needed is one for each of {len(scan)} frames")
-        rows, columns = scan.shape[1:]
-        x_px, y_px = positive("x_px", x_px, zero=True), positive("y_px", y_px, zero=True)
-        if size is not None and (not isinstance(size, Integral) or isinstance(size, bool)):
-            raise TypeError(f"size: got {size!r}, allowed are odd whole numbers")
-        given = size
-        for _ in range(RECENTRED):
-            room = int(min(x_px, y_px, columns - 1 - x_px, rows - 1 - y_px)) - 2
-            where = f"a particle at x_px = {x_px:g}, y_px = {y_px:g} in frames of {columns} by {rows} px"
-            if room < 1:
-                raise ValueError(f"x_px, y_px: got {where}, allowed is one 3 px or more inside")
-            if given is None:
-                half = min(room, LARGEST // 2)
-                size = _image_size(_cut(scan, x_px, y_px, half))
-                if size >= 2 * half - 1 and half == room:
-                    raise ValueError(f"x_px, y_px: got {where}, whose images reach the border: allowed is one inside")
-            if not 3 <= size <= 2 * room + 1 or size % 2 == 0:
-                raise ValueError(f"size: got {size} px, allowed are odd sizes from 3 to {2 * room + 1} for {where}")
-            stack, centres = _centred(scan, z_um, x_px, y_px, size, room)
-            middle = centres.mean(axis=0)
-            if np.abs(middle - (x_px, y_px)).max() <= 1:
-                break
-            x_px, y_px = np.clip(middle, 0, (columns - 1, rows - 1)).tolist()
-        calibration = cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
-        calibration._must_stand_out(where)
-        return calibration
+        from gdptlab.pipeline.bead_images import stack_of_bead
 
-    def _must_stand_out(self, where: str) -> None:
-        """Refuse a stack in whose middle is no particle, or with a brighter one beside it."""
-        noise, edge = max(noise_level(self.stack), 1e-9), self.size // 4
-        smooth = denoised(self.stack)
-        height = np.abs(smooth - np.median(smooth, axis=(1, 2), keepdims=True)).max(axis=0) / noise
-        inside = height[edge : self.size - edge, edge : self.size - edge].max()
-        if inside < max(STANDS_OUT, height.max() / 2):
-            raise ValueError(
-                f"x_px, y_px: got {where}, where nothing stands out by more than {inside:.1f} times the noise (beside "
-                f"it, by {height.max():.1f}); needed is a particle, alone, that does so by {STANDS_OUT:g}"
-            )
+        stack, z_um = stack_of_bead(scan, z_um, x_px, y_px, size)
+        return cls.from_stack(stack, z_um, n_sub=n_sub, n=n, denoise=denoise)
+
+    @classmethod
+    def from_scan(
+        cls,
+        scan: ArrayLike,
+        z_um: ArrayLike,
+        *,
+        beads_px: ArrayLike | None = None,
+        size: int | None = None,
+        n_sub: int | None = None,
+    ) -> Self:
+        """Calibrate with a scan of full frames: beads, size of the templates and subset are found in the scan.
+
+        Parameters
+        ----------
+        scan : array (N, rows, columns)
+            Frames at known depths, of beads that come into focus together (on a plane).
+        z_um : array (N,)
+            Depths, strictly increasing or decreasing, µm.
+        beads_px : array (n, 2), optional
+            x and y of the beads to use, px, all of them; found if not given.
+        size : int, optional
+            Rows and columns of a template, odd. If not given, just enough for the widest image of the beads, or less
+            if more beads of the scan, whose depths are known, are then found. With `beads_px`, the former.
+        n_sub : int, optional
+            Images that frames are correlated with. If not given, as many as it takes for an image at any depth to be
+            like one of them.
+
+        Returns
+        -------
+        Calibration
+            Its attribute `report` says which beads were used, what was chosen, and why.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not of that form, nothing in the scan changes with z, or no bead can be used: the message
+            says why not.
+        """
+        from gdptlab.pipeline.beads import averaged_beads
+
+        return averaged_beads(scan, z_um, beads_px=beads_px, size=size, n_sub=n_sub)
 
     def __len__(self) -> int:
         return len(self.stack)
 
     def __repr__(self) -> str:
-        z_um, ratio = self.z_um, self.signal_to_noise()
+        z_um = self.z_um
         return (
             f"<Calibration: {len(self)} images of {self.size} by {self.size} px, z = {z_um[0]:g} to {z_um[-1]:g} µm, "
-            f"{len(self.subset)} in the subset, signal / noise {ratio.min():.0f} to {ratio.max():.0f}>"
+            f"{len(self.subset)} in the subset>"
         )
 
     @property
@@ -393,33 +385,12 @@ class Calibration:
 
     def correlator(self, shape: tuple[int, int]) -> Correlator:
         """Plan for correlating frames of this shape with the subset, kept for this thread's next frame."""
-        return self.plan(Calibration._correlator, shape)
-
-    def _correlator(self, shape: tuple[int, int]) -> Correlator:
-        return Correlator(self.search_templates[self.subset], shape)
-
-    def plan(self, make: Callable[[Self, tuple[int, int]], Plan], shape: tuple[int, int]) -> Plan:
-        """`make(self, shape)`, a plan for frames of this shape, kept for this thread's next frame."""
-        key = make, shape, threading.get_ident()
-        if key not in self._plans:
-            self._plans[key] = make(self, shape)
-        return self._plans[key]
-
-    def __getstate__(self) -> dict[str, object]:
-        """Plans stay behind when a calibration is sent to another process."""
-        return self.__dict__ | {"_plans": {}}
+        return planned(self, _correlator, shape)
 
     def self_similarity(self) -> NDArray[np.float32]:
         """Correlation of every template with every other, (N, N): what can be told apart, and what cannot."""
         flat = self.templates.reshape(len(self), -1)
         return flat @ flat.T
-
-    def signal_to_noise(self) -> NDArray[np.float64]:
-        """Largest deviation of each denoised image from its median, over the noise of a pixel; (N,)."""
-        smooth = denoised(self.stack)
-        contrast = np.abs(smooth - np.median(smooth, axis=(1, 2), keepdims=True)).max(axis=(1, 2))
-        noise = noise_level(self.stack)
-        return contrast.astype(np.float64) / noise if noise > 0 else np.full(len(self), np.inf)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the calibration to a `.npz` file, whole or not at all."""
@@ -465,6 +436,11 @@ class Calibration:
         return cls(**data)
 
 
+def _correlator(calibration: Calibration, shape: tuple[int, int]) -> Correlator:
+    """Plan for correlating frames of this shape with the calibration's subset."""
+    return Correlator(calibration.search_templates[calibration.subset], shape)
+
+
 def checked(calibration: object) -> Calibration:
     """Return `calibration` if it is one.
 
@@ -475,24 +451,12 @@ def checked(calibration: object) -> Calibration:
     """
     if isinstance(calibration, Calibration):
         return calibration
-    inner = isinstance(getattr(calibration, "calibration", None), Calibration)
-    advice = "; that is its attribute `calibration`" if inner else ""
-    raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration{advice}")
+    raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration")
 
 
 def _middles(n: int, n_sub: int) -> NDArray[np.int64]:
     """Indices of the images in the middle of n_sub equal bins of n."""
     return ((np.arange(n_sub) + 0.5) * (n - 1) / n_sub + 0.5).astype(np.int64)  # to the nearest
-
-
-def _depths(z_um: ArrayLike) -> NDArray[np.float64]:
-    """Check depths, which need more digits than images have."""
-    real_array("z_um", z_um, 1)
-    z_um = np.array(z_um, dtype=np.float64)
-    steps = np.diff(z_um)
-    if not ((steps > 0).all() or (steps < 0).all()):
-        raise ValueError("z_um: got depths that turn or repeat, allowed are strictly increasing or decreasing")
-    return z_um
 
 
 def levelled(images: NDArray) -> NDArray:
@@ -524,63 +488,3 @@ def _even_centre(images: NDArray) -> NDArray:
 def _halved(images: NDArray) -> NDArray[np.float32]:
     """Images at half resolution, the middle pixel of the large on that of the small."""
     return np.stack([cv2.pyrDown(np.ascontiguousarray(image)) for image in _even_centre(images)])
-
-
-def _cut(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
-    x, y = round(x_px), round(y_px)
-    return scan[:, y - half : y + half + 1, x - half : x + half + 1]
-
-
-def _centred(
-    scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int, room: int
-) -> tuple[NDArray, NDArray[np.float64]]:
-    """Images (N, size, size) with the particle on the middle pixel, and where it was, (x, y) in (N, 2)."""
-    centres = _centres(scan, z_um, x_px, y_px, size)
-    margin = min(room + 2 - size // 2, 16)  # for the spline, and for a particle that drifts
-    stack = [
-        shift_image(image, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
-        for image, (x, y) in zip(_cut(scan, x_px, y_px, size // 2 + margin), centres, strict=True)
-    ]
-    return np.stack(stack)[:, margin:-margin, margin:-margin], centres
-
-
-def _image_size(cut: NDArray, faint: float = 0.06) -> int:
-    """Smallest odd size that holds the particle in nearly every slice of (N, 2 r + 1, 2 r + 1).
-
-    An image ends where the median over a ring about the centre, which a neighbour does not move, first falls
-    below the share `faint` of the brightest ring's.
-    """
-    half = cut.shape[-1] // 2
-    y, x = np.indices(cut.shape[1:]) - half
-    ring = np.rint(np.hypot(x, y)).astype(int)
-    reach = []
-    for image in denoised(cut):
-        light = image - np.median(np.concatenate([image[[0, -1]].ravel(), image[:, [0, -1]].ravel()]))
-        profile = np.abs(median(light, ring, np.arange(half + 1)))
-        brightest = int(profile.argmax())
-        faint_from = np.flatnonzero(profile[brightest:] < faint * profile[brightest])
-        reach.append(brightest + int(faint_from[0]) if len(faint_from) else half)
-    return 2 * int(np.percentile(reach, 95)) + 1
-
-
-def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) -> NDArray[np.float64]:
-    """Centre (x, y) of the particle in every slice, (N, 2), px."""
-    cut = levelled(_cut(scan, x_px, y_px, size // 2).astype(np.float32))
-    smooth = denoised(cut)
-    weight = np.einsum("kij,kij->k", smooth, smooth)  # of the particle's light, not of the noise
-    if not weight.all():
-        blank = np.flatnonzero(weight == 0).tolist()
-        raise ValueError(f"scan: got frames without contrast around x_px, y_px at {blank}, allowed are frames with it")
-    shifts = [
-        # Half a turn about the middle moves an image that is symmetric about c by -2 c.
-        phase_cross_correlation(image, image[::-1, ::-1], upsample_factor=100, normalization=None)[0] / 2
-        for image in cut
-    ]
-    order = np.argsort(z_um)
-    weight = weight[order]
-    offsets = np.empty((len(scan), 2))
-    for axis, values in enumerate(np.asarray(shifts).T):
-        if len(scan) >= 5:
-            values[order] = make_smoothing_spline(z_um[order], values[order], w=weight / weight.max())(z_um[order])
-        offsets[:, axis] = values
-    return offsets[:, ::-1] + (round(x_px), round(y_px))

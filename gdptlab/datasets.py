@@ -1,6 +1,6 @@
 """Images to start with: small synthetic samples in `data/`, and real beads that others published.
 
-`python -m gdptlab.datasets` makes the samples anew.
+`python -m gdptlab.experiment.samples` makes the samples anew.
 """
 
 import os
@@ -10,20 +10,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import tifffile
-from IPython import get_ipython
 from numpy.typing import NDArray
 
-from gdptlab.check import choice
-from gdptlab.files import written_whole
-from gdptlab.images import open_images
-from gdptlab.imagetypes import IMAGE_TYPES
-from gdptlab.optics import Microscope
+from gdptlab._checks import choice
 
 DATA = Path(__file__).parents[1] / "data"
 """The samples' folder."""
 
-SIZE = 61
-"""Rows and columns of the sample calibration images, px."""
+SAMPLES = ("fluorescent", "brightfield", "disturbed")
+"""Image types of which there is a sample (the paper, Figure 3)."""
 
 
 @dataclass(frozen=True)
@@ -83,36 +78,13 @@ def sample(image_type: str = "fluorescent") -> Sample:
     -------
     Sample
     """
-    choice("image_type", image_type, IMAGE_TYPES)
+    choice("image_type", image_type, SAMPLES)
     return Sample(
-        stack=np.asarray(open_images(DATA / f"{image_type}-calibration.tif")),
+        stack=tifffile.imread(DATA / f"{image_type}-calibration.tif"),
         z_um=pd.read_csv(DATA / "calibration-z.csv")["z_um"].to_numpy(),
-        frames=np.asarray(open_images(DATA / f"{image_type}-frames.tif")),
+        frames=tifffile.imread(DATA / f"{image_type}-frames.tif"),
         truth=pd.read_csv(DATA / "frames-truth.csv"),
     )
-
-
-def sample_scan(image_type: str = "fluorescent") -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
-    """Make a scan of beads on a slide, with the microscope and the noise of the samples.
-
-    Parameters
-    ----------
-    image_type : {"fluorescent", "brightfield", "disturbed"}
-
-    Returns
-    -------
-    scan : uint16 array (51, 512, 512)
-        Frames of 14 beads, all at the same depth, most of them far enough apart.
-    z_um : float64 array (51,)
-        The depths, -50 to 50 µm.
-    """
-    choice("image_type", image_type, IMAGE_TYPES)
-    microscope, z_um, rng = Microscope(), np.linspace(-50, 50, 51), np.random.default_rng(20250408)
-    places = np.stack(np.meshgrid(*2 * [np.arange(56, 512, 100)]), axis=-1).reshape(-1, 2)
-    x_px, y_px = (rng.permutation(places)[:14] + rng.uniform(-12, 12, (14, 2))).T
-    beads = pd.DataFrame({"x_px": x_px, "y_px": y_px})
-    scan = [microscope.render(beads.assign(z_um=z), image_type=image_type, rng=rng) for z in z_um]
-    return np.stack(scan), z_um
 
 
 def planar_beads() -> PlanarBeads:
@@ -137,55 +109,9 @@ def planar_beads() -> PlanarBeads:
         )
     heights = pd.read_csv(folder / "test_frames.csv")[["frame", "z_plane_um"]].rename(columns={"z_plane_um": "z_um"})
     return PlanarBeads(
-        scan=np.asarray(open_images(folder / "calibration.tif")),
+        scan=tifffile.imread(folder / "calibration.tif"),
         z_um=pd.read_csv(folder / "calibration_z.csv")["z_um"].to_numpy(),
-        frames=np.asarray(open_images(folder / "test.tif")),
+        frames=tifffile.imread(folder / "test.tif"),
         truth=heights.merge(pd.read_csv(folder / "beads.csv"), how="cross"),
         published={p.stem: pd.read_csv(p) for p in sorted((folder / "published").glob("*.csv"))},
     )
-
-
-def end_notebook(reason: str) -> None:
-    """Print why a notebook cannot go on, and let its later cells do nothing instead of failing."""
-    print(reason)
-    shell = get_ipython()
-    if shell is not None:
-        shell.input_transformers_cleanup.append(lambda lines: [])
-
-
-def make_samples(folder: Path = DATA) -> None:
-    """Make the synthetic samples: three frames of 50 particles, the same for all image types."""
-    microscope = Microscope()
-    z_um = np.linspace(-50, 50, 51)
-    rng = np.random.default_rng(20190722)
-    count, (rows, columns) = 50, (512, 512)
-    truth = pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "frame": frame,
-                    "x_px": rng.uniform(0, columns - 1, count).round(3),
-                    "y_px": rng.uniform(0, rows - 1, count).round(3),
-                    "z_um": rng.uniform(-50, 50, count).round(3),
-                }
-            )
-            for frame in range(3)
-        ],
-        ignore_index=True,
-    )
-    for name, table in (("frames-truth.csv", truth), ("calibration-z.csv", pd.DataFrame({"z_um": z_um}))):
-        with written_whole(folder / name) as path:
-            table.to_csv(path, index=False)
-    for image_type in IMAGE_TYPES:
-        stack = microscope.stack(z_um, SIZE, image_type=image_type, rng=rng)
-        frames = [
-            microscope.render(particles, (rows, columns), image_type=image_type, rng=rng)
-            for _, particles in truth.groupby("frame")
-        ]
-        for name, images in (("calibration", stack), ("frames", np.stack(frames))):
-            with written_whole(folder / f"{image_type}-{name}.tif") as path:
-                tifffile.imwrite(path, images, compression="zlib", predictor=True, photometric="minisblack")
-
-
-if __name__ == "__main__":
-    make_samples()

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 from scipy.ndimage import gaussian_filter1d
 
-from gdptlab.cores import on_one_core
+from gdptlab._compiled import on_one_core
 
 WINDOW = 11
 """Images that are filtered together."""
@@ -100,3 +100,10 @@ def noise_level(images: NDArray) -> float:
     """
     mixed = np.diff(np.diff(np.asarray(images, dtype=np.float64), axis=-1), axis=-2)
     return float(np.median(np.abs(mixed)) / (2 * 0.6745))
+
+
+def signal_to_noise(stack: NDArray) -> NDArray[np.float64]:
+    """Largest deviation of each denoised image of (N, n, n) from its median, over the noise of a pixel; (N,)."""
+    smooth, noise = denoised(stack), noise_level(stack)
+    contrast = np.abs(smooth - np.median(smooth, axis=(1, 2), keepdims=True)).max(axis=(1, 2))
+    return contrast.astype(np.float64) / noise if noise > 0 else np.full(len(stack), np.inf)

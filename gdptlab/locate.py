@@ -27,26 +27,16 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
+from gdptlab._checks import choice, flag, positive, real_array, whole
+from gdptlab._compiled import on_one_core
 from gdptlab.calibration import Calibration, checked
-from gdptlab.check import choice, flag, positive, real_array, whole
-from gdptlab.cores import on_one_core
-from gdptlab.images import Images
-from gdptlab.overlap import Explained, Overlap
-from gdptlab.peaks import peaks, strongest
+from gdptlab.correlation import peaks, standardised, strongest, vertex
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""
 
-STD_COLUMNS = ("x_std_px", "y_std_px", "z_std_um")
-"""More of them, if particles are fitted jointly."""
-
-CORRELATED = 5.0
-"""Pixels over which what a joint fit leaves of a particle is alike, about, where it is more than noise: an excess of
-chi2 by 0.1 adds 0.5 times the variance. Found as what makes errors of particles in a crowd agree with their std."""
-
-ODD = 3.0
-"""Standard deviations by which a particle is brighter or fainter than the others where its variance is twice the usual:
-it may not be alone."""
+THRESHOLD = 0.5
+"""Lowest C_m of a particle, if none is given (the paper, section 2: normally 0.5)."""
 
 METHODS = ("correlation", "joint")
 """How `locate` can work."""
@@ -61,7 +51,7 @@ def locate(
     calibration: Calibration,
     *,
     method: str = "correlation",
-    threshold: float = 0.5,
+    threshold: float | None = None,
     refine: bool = True,
     min_distance_px: float | None = None,
 ) -> pd.DataFrame:
@@ -75,8 +65,9 @@ def locate(
     method : str
         "correlation", or "joint": all particles fitted at once, for those that overlap. That is slower, and
         it takes the particles to be about equally bright. It finds its own threshold, from the noise.
-    threshold : float
-        Of "correlation", as are the next two. Lowest C_m of a particle, above 0, at most 1.
+    threshold : float, optional
+        Lowest C_m of a particle, above 0, at most 1; `THRESHOLD` if not given. Like the next two, it belongs to
+        "correlation" and is refused with "joint".
     refine : bool
         Walk along the whole stack to the best C_m. Without it, z comes from the subset's profile alone.
     min_distance_px : float, optional
@@ -110,10 +101,13 @@ def locate(
     ['x_px', 'y_px', 'z_um', 'cm', 'at_end']
     """
     if choice("method", method, METHODS) == "joint":
-        if positive("threshold", threshold) != 0.5 or not flag("refine", refine) or min_distance_px is not None:
+        if threshold is not None or not flag("refine", refine) or min_distance_px is not None:
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
-        return _overlapping(image, calibration, None)[0]
-    image, distance = _checked(image, calibration, threshold, min_distance_px)
+        from gdptlab.fit.joint import explained
+
+        return explained(image, calibration)[0]
+    threshold = THRESHOLD if threshold is None else threshold
+    image, distance = checked_frame(image, calibration, threshold, min_distance_px)
     place, step, cm = _candidates(image, calibration, threshold)
     if flag("refine", refine):
         place, step, cm = _refined(image, calibration, place, step)
@@ -123,14 +117,14 @@ def locate(
         first = _pixels(image, calibration, place)
         shift = calibration.displacement(image, first, np.rint(step))
         place = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
-    return _table(place, step, cm, calibration.z_um)
+    return as_table(place, step, cm, calibration.z_um)
 
 
-def _checked(
+def checked_frame(
     image: ArrayLike, calibration: Calibration, threshold: float, min_distance_px: float | None
 ) -> tuple[NDArray[np.float32], float]:
     """Image, less its mean, and distance in px, if all four are what `locate` takes."""
-    image = _image(image, calibration)
+    image = checked_image(image, calibration)
     if not 0 < positive("threshold", threshold) <= 1:
         raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
     distance = (
@@ -139,7 +133,7 @@ def _checked(
     return image - np.float32(cv2.mean(image)[0]), distance
 
 
-def _image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
+def checked_image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
     """Image, if it is one that holds at least a template."""
     size = checked(calibration).size
     image = real_array("image", image, 2)
@@ -148,7 +142,7 @@ def _image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
     return image
 
 
-def _table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.DataFrame:
+def as_table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.DataFrame:
     """What `locate` returns, of places (y, x) (n, 2), z in steps of the stack, C_m, and the depths of the steps."""
     last = len(z_um) - 1
     return pd.DataFrame(
@@ -162,33 +156,6 @@ def _table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.Data
     )
 
 
-def _overlapping(
-    image: ArrayLike, calibration: Calibration, before: Explained | None
-) -> tuple[pd.DataFrame, Explained]:
-    """Table of a frame by the joint fit, and where the next frame may begin."""
-    image = _image(image, calibration)
-    plan = calibration.plan(Overlap, image.shape)
-    if before is None or before.fit.residual.shape != image.shape:
-        explained = plan.first(image)
-    else:
-        explained = plan.following(image, before)
-    fit = explained.fit
-    y, x, step, brightness = fit.places.T
-    z_um = calibration.z_um
-    table = _table(fit.places[:, :2], step, fit.cm, np.clip(z_um - calibration.own_bias_um, z_um[0], z_um[-1]))
-    steps = np.arange(len(calibration))
-    y_std, x_std, step_std = fit.std.T
-    stds = x_std, y_std, step_std * np.interp(step, steps, np.gradient(z_um))
-    odd = (brightness - explained.brightness) / explained.spread
-    misfit = np.sqrt(1 + CORRELATED * np.maximum(fit.chi2 - 1, 0) + (odd / ODD) ** 2)
-    for name, noise, own in zip(STD_COLUMNS, stds, calibration.own_error.T, strict=True):
-        table[name] = misfit * np.hypot(noise, np.interp(step, steps, own))
-    inside = explained.stays & (y >= -0.5) & (y < image.shape[0] - 0.5) & (x >= -0.5) & (x < image.shape[1] - 0.5)
-    table["brightness"], table["chi2"] = brightness, fit.chi2
-    order = np.argsort(-table["cm"].to_numpy(), kind="stable")
-    return table.iloc[order[inside[order]]].reset_index(drop=True), explained
-
-
 def _candidates(
     image: NDArray[np.float32], calibration: Calibration, threshold: float
 ) -> tuple[NDArray, NDArray, NDArray]:
@@ -197,9 +164,9 @@ def _candidates(
     searched = cv2.pyrDown(image) if scale == 2 else image
     maps = calibration.correlator(searched.shape)(searched)
     place, cm, profile = peaks(maps, threshold, near)
-    likeness = _standardised(profile) @ _standardised(calibration.expected).T
+    likeness = standardised(profile) @ standardised(calibration.expected).T
     k = np.clip(likeness.argmax(axis=1), 1, len(calibration) - 2)
-    step = k + _vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
+    step = k + vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
     middle = calibration.search_templates.shape[-1] // 2
     return scale * (place + middle), step, cm
 
@@ -220,21 +187,6 @@ def _refined(
     part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[k], -0.5, 0.5)
     inner = (k > 0) & (k < last)
     return first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1), k + np.where(inner, part, 0), cm
-
-
-def _vertex(values: NDArray) -> NDArray:
-    """Top, within (-1/2, 1/2), of the parabola through three values (n, 3) at -1, 0 and 1."""
-    before, here, after = values.T
-    bend = before + after - 2 * here
-    slope = (after - before) / 2
-    return np.clip(np.divide(-slope, bend, out=np.sign(slope) / 2, where=bend < 0), -0.5, 0.5)
-
-
-def _standardised(profiles: NDArray) -> NDArray:
-    """Rows with mean 0 and norm 1."""
-    centred = profiles - profiles.mean(axis=1, keepdims=True)
-    norm = np.linalg.norm(centred, axis=1, keepdims=True)
-    return centred / np.where(norm > 0, norm, 1)
 
 
 def batch(
@@ -320,11 +272,13 @@ def in_blocks(
     before a missing block is measured once more; otherwise blocks know nothing of each other.
     """
     if settings.get("method") == "joint":
+        from gdptlab.fit.joint import explained
+
         before = None
         for first, block in _blocks(frames, ()):
             tables = []
             for frame in block:
-                table, before = on_one_core(_overlapping)(frame, calibration, before)
+                table, before = explained(frame, calibration, before)
                 tables.append(table)
             if first not in done:
                 yield first, len(tables), _numbered(tables, first)
@@ -336,18 +290,17 @@ def in_blocks(
 
 def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:
     """Number of the first frame, and frames, of each block not in `done`, to be handed to a process."""
-    is_dask = hasattr(frames, "dask")
-    if isinstance(frames, Images | np.ndarray) or is_dask:
-        blocks = (frames[first : first + BLOCK] for first in range(0, len(frames), BLOCK))  # nothing is read yet
+    if hasattr(frames, "shape"):  # arrays of numpy, dask and zarr, and `Images`: nothing is read yet
+        blocks = (frames[first : first + BLOCK] for first in range(0, len(frames), BLOCK))
     else:
         copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
         blocks = iter(lambda: list(islice(copies, BLOCK)), [])
     for first, block in zip(count(0, BLOCK), blocks, strict=False):
         if first not in done:
             # A list goes along with its task; an array a cluster would put on one worker, and lose with it.
-            if not isinstance(block, Images):
-                block = [np.array(one) for one in (block.compute(scheduler="synchronous") if is_dask else block)]
-            yield first, block
+            if hasattr(block, "dask"):
+                block = block.compute(scheduler="synchronous")
+            yield first, list(block.copy()) if isinstance(block, np.ndarray) else block
 
 
 def _located(

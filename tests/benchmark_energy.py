@@ -9,12 +9,12 @@ import pandas as pd
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from gdptlab import Calibration, batch, figures
-from gdptlab.acoustic_energy import fit_energy
-from gdptlab.channel import Acoustics, Focusing
-from gdptlab.files import written_whole
-from gdptlab.film import Film
-from gdptlab.tracks import link, link_scores
+from gdptlab import Calibration, batch, plots
+from gdptlab._files import written_whole
+from gdptlab.experiment.channel import Acoustics, Focusing
+from gdptlab.experiment.film import Film
+from gdptlab.tracking.acoustic_energy import fit_energy
+from gdptlab.tracking.tracks import link, link_scores
 
 E_AC = 1.2  # J/m³
 FOCUSING = Focusing(acoustics=Acoustics(energy_density_J_m3=E_AC))
@@ -49,7 +49,7 @@ def main() -> None:
         covered = (table[f"{name}_low"] <= E_AC) & (table[f"{name}_high"] >= E_AC)
         off = 100 * (table[f"{name}_value"] / E_AC - 1)
         print(f"{name}: covered {covered.sum()} of {len(table)}, largest deviation {off.abs().max():.4f} %")
-    with written_whole(figures.FIGURES / "energy_of_films.csv") as temporary:
+    with written_whole(plots.FIGURES / "energy_of_films.csv") as temporary:
         table.round(6).to_csv(temporary, index=False)
 
 

@@ -9,14 +9,14 @@ import sys
 import numpy as np
 import pandas as pd
 
-from gdptlab import Calibration, figures, locate
-from gdptlab.channel import Acoustics, Focusing
-from gdptlab.device import Device, closed_loop
-from gdptlab.files import written_whole
-from gdptlab.film import Film
-from gdptlab.monitor import Monitor, Status, Trigger, middle_thirds
-from gdptlab.own_process import OwnProcess
-from gdptlab.replay import Method
+from gdptlab import Calibration, locate, plots
+from gdptlab._files import written_whole
+from gdptlab.experiment import Method
+from gdptlab.experiment.channel import Acoustics, Focusing
+from gdptlab.experiment.film import Film
+from gdptlab.live.device import Device, closed_loop
+from gdptlab.live.monitor import Monitor, Status, Trigger, middle_thirds
+from gdptlab.live.own_process import OwnProcess
 
 AHEAD = 100  # frames rendered before a camera runs
 IN_VIEW = 100.0
@@ -99,7 +99,7 @@ def main() -> None:
         note(f"{what}: delivery of the frame to sound off, median", loop["delay_ms"].median(), "ms", "")
         note(f"{what}: the same, longest", loop["delay_ms"].max(), "ms", "100")
         note(f"{what}: from its exposure, longest", loop["exposure_delay_ms"].max(), "ms", "")
-    with written_whole(figures.FIGURES / "live_timings.csv") as temporary:
+    with written_whole(plots.FIGURES / "live_timings.csv") as temporary:
         pd.DataFrame(rows, columns=["what", "measured", "unit", "allowed"]).to_csv(temporary, index=False)
 
 

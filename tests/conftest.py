@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab import Calibration, Microscope
+from gdptlab import Calibration
+from gdptlab.experiment import Microscope
 
 THOROUGH = bool(os.environ.get("GDPTLAB_THOROUGH"))
 """Whether tests that can be made longer are: `GDPTLAB_THOROUGH=1 pytest tests/test_stream.py`, some minutes each."""

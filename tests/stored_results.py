@@ -15,14 +15,13 @@ import pandas as pd
 from llvmlite import binding
 
 from gdptlab import Calibration, batch, datasets
-from gdptlab.autocalibrate import calibrate
-from gdptlab.channel import Acoustics, Focusing
-from gdptlab.field_calibration import FieldCalibration
-from gdptlab.film import Film
+from gdptlab.experiment import Method, errors, sweep
+from gdptlab.experiment.channel import Acoustics, Focusing
+from gdptlab.experiment.film import Film
+from gdptlab.fit.field_calibration import FieldCalibration
+from gdptlab.fit.over_field import locate_over_field
 from gdptlab.locate import locate
-from gdptlab.over_field import locate_over_field
-from gdptlab.replay import Method, errors, sweep
-from gdptlab.tracks import link, velocities
+from gdptlab.tracking.tracks import link, velocities
 
 STORED = Path(__file__).parent / "stored"
 IMAGE_TYPES = ("fluorescent", "brightfield", "disturbed")
@@ -80,7 +79,7 @@ def tracked() -> pd.DataFrame:
 def beads_correlation() -> pd.DataFrame:
     """Real beads, calibrated with those that stand alone, by correlation."""
     beads = datasets.planar_beads()
-    return batch(beads.frames[[2, 8]], calibrate(beads.scan, beads.z_um).calibration, progress=False)
+    return batch(beads.frames[[2, 8]], Calibration.from_scan(beads.scan, beads.z_um), progress=False)
 
 
 def beads_over_field() -> pd.DataFrame:

@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab.acoustic_energy import fit_energy, imitate
-from gdptlab.channel import Acoustics, Channel, Focusing, Suspension, Trajectories
-from gdptlab.film import Film
+from gdptlab.experiment.channel import Acoustics, Channel, Focusing, Suspension, Trajectories
+from gdptlab.experiment.film import Film
+from gdptlab.tracking.acoustic_energy import fit_energy, imitate
 
 FPS = 12.5
 E_AC = 0.9

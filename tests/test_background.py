@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_particle_images import crowd, dense
 
-from gdptlab.background import BOUNDED, Background
-from gdptlab.particle_images import ParticleImages
+from gdptlab.fit.background import BOUNDED, Background
+from gdptlab.fit.renderer import ParticleImages
 
 SHAPE, KNOT_PX, NOISE = (200, 260), 60.0, 10.0
 COEFFICIENTS = 6 * 7  # round(side / knot) + 3 in each direction

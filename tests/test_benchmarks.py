@@ -13,8 +13,8 @@ import pytest
 from conftest import table
 
 from gdptlab import Calibration, batch, locate
-from gdptlab.film import Film
-from gdptlab.plain import CORRELATE, locate_plainly
+from gdptlab.experiment.film import Film
+from gdptlab.experiment.plain import CORRELATE, locate_plainly
 
 MEMORY_MB = 200  # of `locate` on 512 by 512 px, above the import
 FILM_MB = 130  # that a film may take beyond what a third of it took; its frames, if held, would take 230

@@ -8,10 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import CALIBRATION_SEED, IMAGE_TYPES, Z_UM, table
+from references import correlate_plainly
 
 from gdptlab import Calibration, locate
 from gdptlab.calibration import VERSION, levelled
-from gdptlab.correlation import correlate_plainly, normalised
+from gdptlab.correlation import normalised
+from gdptlab.denoising import signal_to_noise
 
 CENTRE_PX = 0.1  # mean error of x and y with a calibration cut out of a scan
 CENTRE_Z_UM = 1.0  # likewise of z
@@ -176,13 +178,13 @@ def test_self_similarity(calibration):
 def test_signal_to_noise(calibration, clean_stack):
     clean = clean_stack.astype(float)
     expected = (clean - np.median(clean, axis=(1, 2), keepdims=True)).max(axis=(1, 2)) / 38
-    assert calibration.signal_to_noise().shape == (51,)
-    np.testing.assert_allclose(calibration.signal_to_noise(), expected, rtol=0.1)
+    assert signal_to_noise(calibration.stack).shape == (51,)
+    np.testing.assert_allclose(signal_to_noise(calibration.stack), expected, rtol=0.1)
 
 
 def test_signal_to_noise_is_that_of_the_contrast(calibrations):
     """Dark particles on a bright field have the contrast of bright ones on a dark field."""
-    bright, dark = (calibrations[k].signal_to_noise() for k in ("fluorescent", "brightfield"))
+    bright, dark = (signal_to_noise(calibrations[k].stack) for k in ("fluorescent", "brightfield"))
     np.testing.assert_allclose(dark, bright, rtol=0.2)
 
 
@@ -202,7 +204,7 @@ def scan(request, microscope):
         for k, z in enumerate(SCAN_Z_UM)
     ]
     frames = np.stack(frames)
-    return request.param, frames, Calibration.from_scan(frames, SCAN_Z_UM, 68, 50, size=61)  # off by (-1.2, 1.3) px
+    return request.param, frames, Calibration.from_bead(frames, SCAN_Z_UM, 68, 50, size=61)  # off by (-1.2, 1.3) px
 
 
 def measured_errors(microscope, made, kind, seed=91):
@@ -239,7 +241,7 @@ def test_scan_drift_is_followed(scan, clean_stack):
 
 def test_size_is_found_by_itself(scan, clean_stack):
     _, frames, _ = scan
-    made = Calibration.from_scan(frames, SCAN_Z_UM, 67, 51)
+    made = Calibration.from_bead(frames, SCAN_Z_UM, 67, 51)
     assert made.size % 2 == 1
     assert 55 <= made.size <= 75
     cut = (61 - min(made.size, 61)) // 2
@@ -250,8 +252,8 @@ def test_size_is_found_by_itself(scan, clean_stack):
 
 def test_scan_falling_is_rising(scan):
     _, frames, _ = scan
-    rising = Calibration.from_scan(frames, SCAN_Z_UM, 67, 51, size=41, n=11, n_sub=4)
-    falling = Calibration.from_scan(frames[::-1], SCAN_Z_UM[::-1], 67, 51, size=41, n=11, n_sub=4)
+    rising = Calibration.from_bead(frames, SCAN_Z_UM, 67, 51, size=41, n=11, n_sub=4)
+    falling = Calibration.from_bead(frames[::-1], SCAN_Z_UM[::-1], 67, 51, size=41, n=11, n_sub=4)
     np.testing.assert_allclose(falling.stack, rising.stack, rtol=1e-4)
     assert len(rising) == 11 and len(rising.subset) == 4
 
@@ -265,13 +267,13 @@ def test_scan_refuses_a_particle_at_the_border(scan, x, y, size, largest):
         f"^size: got {size} px, allowed are odd sizes from 3 to {largest} for a particle at x_px = {x}, y_px = {y}"
     )
     with pytest.raises(ValueError, match=message):
-        Calibration.from_scan(scan[1], SCAN_Z_UM, x, y, size=size)
+        Calibration.from_bead(scan[1], SCAN_Z_UM, x, y, size=size)
 
 
 @pytest.mark.parametrize(("x", "y"), [(0, 0), (169, 103), (400, 50), (50, 400), (1, 50)])
 def test_scan_refuses_a_particle_on_the_border(scan, x, y):
     with pytest.raises(ValueError, match=f"^x_px, y_px: got a particle at x_px = {x}, y_px = {y} in frames of 170"):
-        Calibration.from_scan(scan[1], SCAN_Z_UM, x, y)
+        Calibration.from_bead(scan[1], SCAN_Z_UM, x, y)
 
 
 @pytest.mark.parametrize(
@@ -574,8 +576,8 @@ def test_plans_stay_behind_when_a_calibration_is_sent(stacks):
 def test_a_rough_place_will_do(scan, away) -> None:
     """The particle is looked for about it, and the template no larger for it."""
     x, y = 67 + away[0], 51 + away[1]
-    exact = Calibration.from_scan(scan[1], SCAN_Z_UM, 67, 51, size=61)
-    rough = Calibration.from_scan(scan[1], SCAN_Z_UM, x, y, size=61)
+    exact = Calibration.from_bead(scan[1], SCAN_Z_UM, 67, 51, size=61)
+    rough = Calibration.from_bead(scan[1], SCAN_Z_UM, x, y, size=61)
     assert np.einsum("kij,kij->k", exact.templates, rough.templates).min() > 0.97
 
 
@@ -589,14 +591,14 @@ def test_an_empty_place_is_refused() -> None:
 
 
 def test_the_smallest_template(scan):
-    assert Calibration.from_scan(scan[1], SCAN_Z_UM, 68, 50, size=3).size == 3
+    assert Calibration.from_bead(scan[1], SCAN_Z_UM, 68, 50, size=3).size == 3
 
 
 def test_a_particle_cut_by_the_border_is_refused(microscope) -> None:
     particle = table([19.0], [60.0], [0.0])
     frames = np.array([microscope.render(particle.assign(z_um=z), (120, 120), rng=3) for z in SCAN_Z_UM])
     with pytest.raises(ValueError, match="whose images reach the border"):
-        Calibration.from_scan(frames, SCAN_Z_UM, 19, 60)
+        Calibration.from_bead(frames, SCAN_Z_UM, 19, 60)
 
 
 def test_a_calibration_says_what_it_is(calibration) -> None:

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
-from gdptlab.channel import Acoustics, Channel, Focusing, Suspension, Trajectories
+from gdptlab.experiment.channel import Acoustics, Channel, Focusing, Suspension, Trajectories
 
 PAPER = Focusing()
 RESONANT = Focusing(acoustics=Acoustics(two_half_waves=True))

@@ -3,9 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from references import correlate_plainly
 from skimage.feature import match_template
 
-from gdptlab.correlation import Correlator, correlate_plainly, normalised
+from gdptlab.correlation import Correlator, good_shape, normalised, peaks, strongest, times_conjugate
 
 AGREE = 2e-5  # in C_m, at float32
 AGREE_WITH_OFFSET = 2e-3  # in C_m, contrast of 20 on 20000 counts
@@ -100,3 +101,82 @@ def test_normalised():
     unit = normalised(images)
     np.testing.assert_allclose(unit.mean(axis=(1, 2)), 0, atol=1e-7)
     np.testing.assert_allclose((unit**2).sum(axis=(1, 2)), [1, 1, 0, 1], atol=1e-6)
+
+
+# -------------------- spectra
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 8), (12, 2), (30, 36), (54, 20)])
+def test_times_conjugate(shape):
+    image, template = np.random.default_rng(0).normal(size=(2, *shape)).astype(np.float32)
+    one, other = cv2.dft(image), cv2.dft(template)
+    product = np.full(shape, np.nan, np.float32)
+    times_conjugate(one, other, product)
+    expected = cv2.mulSpectrums(one, other, 0, conjB=True)
+    np.testing.assert_allclose(product, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_good_shape():
+    assert good_shape((1, 2, 31, 257)) == (2, 2, 32, 270)
+    for n in range(1, 700, 7):
+        (good,) = good_shape([n])
+        assert n <= good <= 1.2 * n + 2 and good % 2 == 0
+
+
+# -------------------- peaks
+
+
+def hill(shape, row, column, height=1.0, width=3.0):
+    y, x = np.indices(shape)
+    return (height * np.exp(-((y - row) ** 2 + (x - column) ** 2) / (2 * width**2))).astype(np.float32)
+
+
+@pytest.mark.parametrize("near", [1, 2])
+def test_between_pixels(near):
+    maps = np.stack([hill((40, 50), 20.3, 30.4, 0.6), hill((40, 50), 20.3 + near / 2, 29.7, 0.9)])
+    place, cm, profile = peaks(maps, 0.5, near)
+    np.testing.assert_allclose(place, [[20.3 + near / 2, 29.7]], atol=0.03)  # of the highest
+    np.testing.assert_allclose(profile, [[0.6, 0.9]], atol=0.003)
+    np.testing.assert_allclose(cm, 0.9, atol=0.003)
+
+
+def test_threshold_and_neighbours():
+    map_ = np.maximum(hill((60, 60), 20, 20, 0.8), hill((60, 60), 40, 40, 0.45))
+    assert len(peaks(map_[None], 0.5, 1)[0]) == 1
+    assert len(peaks(map_[None], 0.4, 1)[0]) == 2
+    map_[20, 22] = 0.81  # two pixels away, and higher
+    assert peaks(map_[None], 0.5, 1)[0].round().tolist() == [[20, 22]]
+
+
+@pytest.mark.parametrize("near", [1, 2])
+def test_no_peak_on_the_rim(near):
+    for row in range(near):
+        assert len(peaks(hill((20, 20), row, 10)[None], 0.5, near)[0]) == 0
+    place, _, profile = peaks(hill((20, 20), near, 10)[None], 0.5, near)
+    assert place.round().tolist() == [[near, 10]] and profile.shape == (1, 1)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 5), (3, 3)])
+def test_small_maps(shape):
+    place, cm, profile = peaks(np.ones((4, *shape), np.float32), 0.5, 2)
+    assert place.shape == (0, 2) and cm.shape == (0,) and profile.shape == (0, 4)
+
+
+def test_the_strongest_of_near_ones():
+    place = np.array([[0.0, 0], [3, 4], [3, 5], [20, 0], [20, 1], [40, 0]])
+    cm = np.array([0.9, 0.8, 0.7, 0.6, 0.95, 0.0])
+    assert strongest(place, cm, 5.0).tolist() == [4, 0, 2]  # the last has none; of equal distance is too near
+    assert strongest(place, cm, 0.0).tolist() == [4, 0, 1, 2, 3]
+    assert strongest(place[:0], cm[:0], 5.0).tolist() == []
+
+
+def test_of_a_crowd_all_stay_apart_and_nobody_is_forgotten():
+    rng = np.random.default_rng(2)
+    place, cm = rng.uniform(0, 100, (300, 2)), rng.uniform(0.1, 1, 300)
+    kept = strongest(place, cm, 8.0)
+    away = np.linalg.norm(place[:, None] - place[kept], axis=2)
+    among = away[kept] + np.diag(np.full(len(kept), np.inf))
+    assert among.min() > 8
+    others = np.setdiff1d(np.arange(300), kept)
+    stronger = cm[kept] >= cm[others, None]
+    assert ((away[others] <= 8) & stronger).any(axis=1).all()

@@ -5,8 +5,9 @@ import pandas as pd
 import pytest
 
 from gdptlab import Calibration, batch, datasets, locate, match
-from gdptlab.images import open_images
-from gdptlab.imagetypes import IMAGE_TYPES
+from gdptlab.experiment import IMAGE_TYPES
+from gdptlab.experiment.samples import make_samples
+from gdptlab.pipeline.images import open_images
 
 # Found and RMSE of z in µm of published methods on the planar beads, by the score of `score`.
 PUBLISHED = {"gdpt": (0.36, 1.66, -0.63), "defocustracker": (0.50, 1.78, -0.47), "idpt": (0.95, 0.67, 0.05)}
@@ -47,7 +48,7 @@ def test_unknown_sample():
 
 def test_samples_can_be_made_again(microscope, tmp_path):
     """To a count here and there, since tracing may round differently on another machine."""
-    datasets.make_samples(tmp_path)
+    make_samples(tmp_path)
     names = sorted(p.name for p in tmp_path.iterdir())
     assert names == sorted(p.name for p in datasets.DATA.iterdir() if p.suffix in (".tif", ".csv"))
     for name in names:
@@ -110,7 +111,7 @@ def test_published_scores(beads, method):
 
 def test_one_bead_measures_the_others(beads):
     """One isolated bead near the middle of the scan; of four such beads the one with the smallest error."""
-    made = Calibration.from_scan(beads.scan, beads.z_um, 244, 230, size=29)
+    made = Calibration.from_bead(beads.scan, beads.z_um, 244, 230, size=29)
     found, rmse, bias = score(batch(beads.frames, made, progress=False), beads.truth)
     print(f"found {found:.2f}, RMSE z {rmse:.2f} um, bias {bias:.2f} um")
     assert found >= FOUND

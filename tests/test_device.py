@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab.channel import Acoustics, Focusing, Trajectories
-from gdptlab.device import SLOTS, Device, Switched, closed_loop, switched, timed, true_shares
-from gdptlab.film import Film
-from gdptlab.replay import fractions, trigger_time
+from gdptlab.experiment import fractions, trigger_time
+from gdptlab.experiment.channel import Acoustics, Focusing, Trajectories
+from gdptlab.experiment.film import Film
+from gdptlab.live.device import SLOTS, Device, Switched, closed_loop, switched, timed, true_shares
 
 FAST = Focusing(acoustics=Acoustics(energy_density_J_m3=30.0))  # all is over after half a second
 SHAPE = (320, 180)

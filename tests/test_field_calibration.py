@@ -8,10 +8,10 @@ import pytest
 from conftest import THOROUGH
 
 from gdptlab import datasets, match
-from gdptlab.assess import scores
-from gdptlab.field_calibration import DIFFER, DIFFER_PX, FieldCalibration, find_beads
-from gdptlab.field_images import FINE, FieldImages, field_terms
-from gdptlab.over_field import AMBIGUOUS, decided_by_plane, locate_over_field
+from gdptlab.assessment import scores
+from gdptlab.fit.field_calibration import DIFFER, DIFFER_PX, FieldCalibration, find_beads
+from gdptlab.fit.field_images import FINE, FieldImages, field_terms
+from gdptlab.fit.over_field import AMBIGUOUS, decided_by_plane, locate_over_field
 
 SHAPE = (220, 280)
 Z_UM = np.arange(-16.0, 17.0)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gdptlab.files import cache_folder, written_whole
+from gdptlab._files import cache_folder, written_whole
 
 
 def test_content_arrives_under_the_name_asked_for(tmp_path: Path) -> None:

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab.channel import Acoustics, Channel, Focusing, Suspension, Trajectories
-from gdptlab.film import Film
-from gdptlab.imagetypes import Camera
-from gdptlab.optics import Microscope
+from gdptlab.experiment import Camera
+from gdptlab.experiment.channel import Acoustics, Channel, Focusing, Suspension, Trajectories
+from gdptlab.experiment.film import Film
+from gdptlab.experiment.microscope import Microscope
 
 SHAPE = (330, 210)
 QUIET = Camera(read_noise=0.0)

@@ -16,14 +16,13 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from gdptlab import Calibration, batch, locate, match
-from gdptlab.assess import scores, scores_by_z
-from gdptlab.autocalibrate import calibrate
+from gdptlab.assessment import scores, scores_by_z
 from gdptlab.datasets import DATA
-from gdptlab.images import open_images, open_scan
-from gdptlab.quality import report
-from gdptlab.settings import choose_settings
-from gdptlab.stream import batch_to_parquet
-from gdptlab.tables import in_um, save_points, save_table
+from gdptlab.pipeline.images import open_images, open_scan
+from gdptlab.pipeline.quality import report
+from gdptlab.pipeline.settings import choose_settings
+from gdptlab.pipeline.stream import batch_to_parquet
+from gdptlab.pipeline.tables import in_um, save_points, save_table
 
 tried = settings(
     max_examples=2000 if THOROUGH else 60,
@@ -218,7 +217,7 @@ def test_from_scan(scan, z_um, x_px, y_px, given):
     names = ("scan", "stack", "z_um", "x_px", "y_px", "size", "n_sub", "n", "denoise")
     fit = isinstance(scan, np.ndarray) and scan.ndim == 3
     z_um = np.arange(len(scan)) if fit and isinstance(z_um, np.ndarray) else z_um
-    made = fails_by_name(lambda: Calibration.from_scan(scan, z_um, x_px, y_px, **given), *names)
+    made = fails_by_name(lambda: Calibration.from_bead(scan, z_um, x_px, y_px, **given), *names)
     if made is not None:
         assert_sound_calibration(made)
 
@@ -232,10 +231,12 @@ def test_from_scan(scan, z_um, x_px, y_px, given):
 def test_calibrate(scan, z_um, given):
     fit = isinstance(scan, np.ndarray) and scan.ndim == 3
     z_um = np.arange(len(scan)) if fit and isinstance(z_um, np.ndarray) else z_um
-    made = fails_by_name(lambda: calibrate(scan, z_um, **given), "scan", "stack", "z_um", "beads_px", "size", "n_sub")
+    made = fails_by_name(
+        lambda: Calibration.from_scan(scan, z_um, **given), "scan", "stack", "z_um", "beads_px", "size", "n_sub"
+    )
     if made is not None:
-        assert_sound_calibration(made.calibration)
-        assert np.isfinite(made.drift_px).all() and len(report(made)) == 9
+        assert_sound_calibration(made)
+        assert np.isfinite(made.report.drift_px).all() and len(report(made)) == 9
 
 
 @tried

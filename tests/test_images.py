@@ -8,7 +8,7 @@ import pytest
 import tifffile
 
 from gdptlab import batch
-from gdptlab.images import Images, open_images, open_scan
+from gdptlab.pipeline.images import Images, open_images, open_scan
 
 FILM = np.random.default_rng(1).integers(0, 200, (12, 9, 14), dtype=np.uint8)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from test_particle_images import NOISE, crowd, dense, drawn
 
-from gdptlab.background import Background
-from gdptlab.joint_fit import DAMPING, LONGEST_STEP, fitted
-from gdptlab.particle_images import ParticleImages
+from gdptlab.fit.background import Background
+from gdptlab.fit.joint_fit import DAMPING, LONGEST_STEP, fitted
+from gdptlab.fit.renderer import ParticleImages
 
 SHAPE = (120, 160)
 UM_PER_STEP = 2.0

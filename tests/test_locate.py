@@ -11,7 +11,7 @@ import pytest
 from conftest import IMAGE_TYPES, SIZE_PX, Z_UM, on_grid, table
 
 from gdptlab import Calibration, batch, locate, match
-from gdptlab.assess import scores
+from gdptlab.assessment import scores
 from gdptlab.locate import BLOCK, COLUMNS, _refined
 
 # Isolated particles, the dimmest with a peak of ten times the read noise.

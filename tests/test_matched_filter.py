@@ -1,14 +1,15 @@
 """Matched filter: lone particles and their gain, crowds with and without whitening, noise."""
 
+import cv2
 import numpy as np
 import pytest
 from conftest import Z_UM
 from test_particle_images import crowd, drawn
 
 from gdptlab import Calibration
-from gdptlab.matched_filter import MatchedFilter
-from gdptlab.overlap import LEAST_GAIN
-from gdptlab.particle_images import ParticleImages
+from gdptlab.fit.matched_filter import MatchedFilter, packed, smooth_power
+from gdptlab.fit.renderer import ParticleImages
+from gdptlab.fit.search import LEAST_GAIN
 
 SHAPE = (256, 256)  # at half resolution
 NOISE = 19.0  # likewise
@@ -161,3 +162,12 @@ def test_frames_of_any_shape(images, shape):
             frame + noise(6, shape), NOISE, whiten=whiten, least=LEAST_GAIN, share=0, apart_px=5
         )
         np.testing.assert_allclose(places[gain.argmax(), :2], (y, x), atol=1)
+
+
+def test_power_and_factors_have_one_order():
+    """A spectrum over its own root of power is white."""
+    image = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(96, 128)).astype(np.float32), (0, 0), 0.7)
+    spectrum = cv2.dft(image)
+    white = cv2.idft(spectrum / np.sqrt(packed(smooth_power(spectrum, 2.0))), flags=cv2.DFT_SCALE)
+    beside = [np.corrcoef(a[:, :-1].ravel(), a[:, 1:].ravel())[0, 1] for a in (image, white)]
+    assert beside[0] > 0.4 and abs(beside[1]) < 0.1

@@ -15,11 +15,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab import locate, logbook, replay
-from gdptlab.channel import Channel
-from gdptlab.logbook import Logbook, read_log
-from gdptlab.monitor import Frame, MiddleThird, Monitor, Trigger, at_speed, middle_thirds
-from gdptlab.own_process import OwnProcess
+from gdptlab import locate
+from gdptlab.experiment import replay
+from gdptlab.experiment.channel import Channel
+from gdptlab.live import logbook
+from gdptlab.live.logbook import Logbook, read_log
+from gdptlab.live.monitor import Frame, MiddleThird, Monitor, Trigger, at_speed, middle_thirds
+from gdptlab.live.own_process import OwnProcess
 
 SHAPE = (3, 5)
 

@@ -6,8 +6,8 @@ import pytest
 from conftest import table
 
 from gdptlab import locate
-from gdptlab.assess import scores
-from gdptlab.plain import CORRELATE, locate_plainly
+from gdptlab.assessment import scores
+from gdptlab.experiment.plain import CORRELATE, locate_plainly
 
 CONFIDENCE = 2.58  # standard errors of a difference: 99 % of such intervals hold the truth
 SIGMAS = ["sigma_x_px", "sigma_y_px", "sigma_z_um"]

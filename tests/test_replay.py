@@ -6,12 +6,22 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab import replay
 from gdptlab.calibration import Calibration
-from gdptlab.channel import Acoustics, Channel, Focusing
-from gdptlab.film import Film
+from gdptlab.experiment import replay
+from gdptlab.experiment.channel import Acoustics, Channel, Focusing
+from gdptlab.experiment.film import Film
+from gdptlab.experiment.replay import (
+    Method,
+    errors,
+    evaluate,
+    expected_delay,
+    fractions,
+    summary,
+    sweep,
+    trigger_time,
+    watch,
+)
 from gdptlab.locate import locate
-from gdptlab.replay import Method, errors, evaluate, expected_delay, fractions, summary, sweep, trigger_time, watch
 
 FAST = Focusing(acoustics=Acoustics(energy_density_J_m3=30.0))  # all is over after half a second
 CALLS = []

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab import Calibration, assess, batch, locate
-from gdptlab.settings import choose_settings
+from gdptlab import Calibration, assessment, batch, locate
+from gdptlab.pipeline.settings import choose_settings
 
 
 @pytest.mark.parametrize("kind", ["fluorescent", "brightfield", "disturbed"])
@@ -13,7 +13,7 @@ def test_threshold_keeps_particles_and_leaves_noise_out(isolated, calibrations, 
     frames, truth = isolated[kind]
     settings = choose_settings(frames, calibrations[kind], method="correlation", looked_at=2)
     assert settings.threshold < 0.6 and not settings.inverted
-    score = assess.scores(locate(frames[3], calibrations[kind], **settings.arguments), of(truth, 3))
+    score = assessment.scores(locate(frames[3], calibrations[kind], **settings.arguments), of(truth, 3))
     assert score.recall > 0.95 and score.precision > 0.95
     assert ((settings.false["cm"] >= settings.threshold).sum()) <= 0.01 * len(settings.found)
 

@@ -18,8 +18,8 @@ from conftest import THOROUGH, table
 from joblib import parallel_config
 
 from gdptlab import Calibration, batch
-from gdptlab.images import open_images
-from gdptlab.stream import NOTE, batch_to_parquet
+from gdptlab.pipeline.images import open_images
+from gdptlab.pipeline.stream import NOTE, batch_to_parquet
 
 SETTINGS = {"correlation": {"refine": False}, "joint": {"method": "joint"}}
 
@@ -201,7 +201,7 @@ RUN = """
 import sys
 import numpy as np
 from gdptlab import Calibration
-from gdptlab.stream import batch_to_parquet
+from gdptlab.pipeline.stream import batch_to_parquet
 film, made, folder, method, n_jobs = sys.argv[1:]
 settings = {"method": "joint"} if method == "joint" else {"refine": False}
 batch_to_parquet(film, Calibration.load(made), folder, n_jobs=int(n_jobs), progress=False, **settings)

@@ -8,7 +8,7 @@ import pytest
 
 import gdptlab
 from gdptlab import Calibration, locate
-from gdptlab.tables import fingerprint, in_um, save_points, save_table
+from gdptlab.pipeline.tables import fingerprint, in_um, save_points, save_table
 
 PARTICLES = pd.DataFrame(
     {

@@ -5,9 +5,9 @@ import pandas as pd
 import pytest
 
 from gdptlab import Calibration, batch
-from gdptlab.channel import Channel, Focusing, Trajectories
-from gdptlab.film import Film
-from gdptlab.tracks import identify, link, link_scores, velocities
+from gdptlab.experiment.channel import Channel, Focusing, Trajectories
+from gdptlab.experiment.film import Film
+from gdptlab.tracking.tracks import identify, link, link_scores, velocities
 
 FPS = 20.0
 CHANNEL = Channel(width_um=180, height_um=90, flow_rate_ul_h=40)  # 1.4 mm/s on the axis: 68 µm in a frame

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gdptlab.versions import versions
+from gdptlab._versions import versions
 
 
 def test_names_every_direct_dependency() -> None:

@@ -1,0 +1,67 @@
+"""The camera: light becomes counts, with offset, read noise, photon noise and bit depth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gdptlab._checks import positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A sensor: offset, read noise, photon noise, bit depth.
+
+    Attributes
+    ----------
+    background : float
+        Counts of a pixel without light.
+    read_noise : float
+        Standard deviation of the Gaussian noise of a pixel, counts. With the default microscope the
+        dimmest particle of the channel (z = +50 µm) peaks ten times as high.
+    electrons_per_count : float or None
+        Photo-electrons behind one count of light; light then carries Poisson noise. None: no photon noise.
+    bit_depth : int
+        Counts are rounded and cut off at 2**bit_depth - 1 (at most 16).
+    """
+
+    background: float = 500.0
+    read_noise: float = 38.0
+    electrons_per_count: float | None = None
+    bit_depth: int = 16
+
+    def __post_init__(self) -> None:
+        positive("background", self.background, zero=True)
+        positive("read_noise", self.read_noise, zero=True)
+        if self.electrons_per_count is not None:
+            positive("electrons_per_count", self.electrons_per_count)
+        if self.bit_depth not in range(1, 17):
+            raise ValueError(f"bit_depth: got {self.bit_depth!r}, allowed are whole numbers from 1 to 16")
+
+    def record(self, light: NDArray, rng: np.random.Generator | int | None = None) -> NDArray[np.uint16]:
+        """Turn light into a frame.
+
+        Parameters
+        ----------
+        light : array (rows, columns)
+            Expected counts above the background; below zero is taken as no light.
+        rng : numpy Generator or int, optional
+            Source of the noise. Without it the frame is the one a noiseless camera would take.
+
+        Returns
+        -------
+        uint16 array (rows, columns)
+        """
+        counts = np.maximum(light, 0, dtype=np.float32)
+        if rng is not None:
+            rng = np.random.default_rng(rng)
+            if self.electrons_per_count is not None:
+                gain = self.electrons_per_count
+                counts = rng.poisson(counts * gain).astype(np.float32) / np.float32(gain)
+            if self.read_noise:
+                noise = rng.standard_normal(counts.shape, np.float32)
+                noise *= np.float32(self.read_noise)
+                counts += noise
+        counts += np.float32(self.background)
+        np.clip(np.rint(counts, out=counts), 0, 2**self.bit_depth - 1, out=counts)
+        return counts.astype(np.uint16)

@@ -1,0 +1,451 @@
+"""The paper's experiment without its camera: a flow carries spheres while sound pushes them to the middle.
+
+Axes: x points downstream, y across the width w, z across the height h; y = z = 0 is the channel's centre,
+and the field of view is 0 ≤ x ≤ `view_length_um`. Lengths are in µm, times in s, speeds in µm/s.
+
+All particles are alike. They move with the fluid along x, and across it at the radiation velocity of
+eqs (1a, 1b) of Rossi & Barnkob. As in the paper there is no streaming and no gravity (a 5 µm polystyrene
+sphere sinks at about 0.8 µm/s), nor do particles feel the walls or each other. So y and z have closed
+forms, and only x needs a quadrature.
+"""
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from numbers import Integral
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, PPoly
+
+from gdptlab._checks import choice, positive
+
+_TERMS = 100  # of the Poiseuille series: error 4e-6 of the peak on a wall, 1e-10 one particle radius off it
+_KNOTS = 10  # of the path integral, per focusing time: error 2e-6 µm in 20 s
+
+
+def _positive_fields(obj: Any) -> None:
+    """Store the float fields of a frozen dataclass as plain floats above 0, or refuse them."""
+    for item in fields(obj):
+        if item.type is float:
+            object.__setattr__(obj, item.name, positive(item.name, getattr(obj, item.name)))
+
+
+def _instance(name: str, value: Any, kind: type) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: got {value!r}, allowed is a {kind.__name__}")
+
+
+def _within(name: str, value: ArrayLike, limit: float) -> NDArray[np.float64]:
+    """Return `value` as an array if, but for rounding, all of it lies within ± `limit` µm."""
+    array = np.asarray(value, dtype=float)
+    outside = ~(np.abs(array) <= limit * (1 + 1e-12))  # in this form NaN is outside
+    if outside.any():
+        raise ValueError(f"{name}: got {array[outside].flat[0]}, allowed is -{limit:g} to {limit:g} µm")
+    return np.clip(array, -limit, limit)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Channel:
+    """A straight channel of rectangular cross-section and the flow through it.
+
+    Attributes
+    ----------
+    width_um, height_um : float
+        Extents along y and z (paper, section 4: 200 and 100).
+    flow_rate_ul_h : float
+        Volume flow rate Q in µl/h (paper: 0.4).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is not a finite number above 0, or a name is unknown.
+    """
+
+    width_um: float = 200.0
+    height_um: float = 100.0
+    flow_rate_ul_h: float = 0.4
+
+    def __post_init__(self) -> None:
+        _positive_fields(self)
+
+    @property
+    def mean_speed_um_s(self) -> float:
+        """Flow rate over cross-section."""
+        return self.flow_rate_ul_h * 1e9 / 3600 / (self.width_um * self.height_um)
+
+    @property
+    def max_speed_um_s(self) -> float:
+        """Speed on the centre line."""
+        return float(self.velocity(0.0, 0.0))
+
+    def velocity(self, y_um: ArrayLike, z_um: ArrayLike) -> NDArray[np.float64]:
+        """Poiseuille velocity along x, in µm/s, at points inside the channel (y and z broadcast together).
+
+        This is the single Fourier series of the rectangular duct (Bruus, Theoretical Microfluidics, 2008,
+        section 3.4.4), its plane part summed to the parabola over the shorter side. The rest corrects for
+        the other two walls and dies off exponentially away from them, where a double series needs thousands
+        of terms. Divided by its own mean, which has a closed form, and scaled to Q.
+
+        Raises
+        ------
+        ValueError
+            If a point is outside the channel.
+        """
+        along = _within("y_um", y_um, self.width_um / 2)
+        across = _within("z_um", z_um, self.height_um / 2)
+        long, short = self.width_um, self.height_um
+        if long < short:
+            along, across, long, short = across, along, short, long
+        n = 2 * np.arange(_TERMS) + 1
+        sign = np.where(n % 4 == 1, 1, -1)
+        weight = sign * 32 / (np.pi * n) ** 3 / (1 + np.exp(-n * np.pi * long / short))
+        profile = 1 - (2 * across / short) ** 2
+        for side in (-1, 1):  # cosh(nπ along / short) cos(nπ across / short) is the real part of two powers
+            q = np.exp(np.pi / short * (side * along - long / 2 + 1j * across))
+            profile = profile - (q * np.polynomial.polynomial.polyval(q * q, weight)).real
+        loss = 192 / (np.pi * n) ** 5 * short / long * np.tanh(n * np.pi * long / (2 * short))
+        return self.mean_speed_um_s * profile / (2 / 3 * (1 - loss.sum()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suspension:
+    """Equal spheres in a liquid; by default the paper's, 5 µm polystyrene in water at 25 °C.
+
+    Attributes
+    ----------
+    radius_um : float
+        a of eqs (1a, 1b) (paper, section 4: 2a = 5 µm).
+    density_kg_m3, compressibility_per_TPa : float
+        Of the spheres; not in the paper. Density 1050, longitudinal sound speed c = 2350 m/s and Poisson's
+        ratio s = 0.35 of polystyrene (Muller et al., Lab Chip 12 (2012) 4617) give a compressibility
+        3 (1 - s) / (1 + s) / (ρ c²) = 249 per TPa. Published values run from 172 to 330.
+    fluid_density_kg_m3, sound_speed_m_s, viscosity_mPa_s : float
+        Of the liquid; water at 25 °C.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is not a finite number above 0, or a name is unknown.
+    """
+
+    radius_um: float = 2.5
+    density_kg_m3: float = 1050.0
+    compressibility_per_TPa: float = 249.0
+    fluid_density_kg_m3: float = 997.0
+    sound_speed_m_s: float = 1497.0
+    viscosity_mPa_s: float = 0.890
+
+    def __post_init__(self) -> None:
+        _positive_fields(self)
+
+    @property
+    def contrast_factor(self) -> float:
+        """Acoustic contrast factor Φ, inviscid (Settnes & Bruus, Phys. Rev. E 85 (2012) 016327)."""
+        density = self.density_kg_m3 / self.fluid_density_kg_m3
+        fluid_modulus = self.fluid_density_kg_m3 * self.sound_speed_m_s**2
+        softness = self.compressibility_per_TPa * 1e-12 * fluid_modulus
+        return ((5 * density - 2) / (2 * density + 1) - softness) / 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Acoustics:
+    """The two standing half waves, across the width and across the height.
+
+    Attributes
+    ----------
+    energy_density_J_m3 : float
+        E_ac (paper: 1.2).
+    two_half_waves : bool
+        The paper prints one amplitude for y and z, as if both waves had the width's wavenumber π/w: False,
+        U_z = U_y. But a half wave across the height has π/h: True, U_z = U_y w/h, here twice U_y.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is not of its kind, the energy density not above 0, or a name is unknown.
+    """
+
+    energy_density_J_m3: float = 1.2
+    two_half_waves: bool = False
+
+    def __post_init__(self) -> None:
+        _positive_fields(self)
+        _instance("two_half_waves", self.two_half_waves, bool)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Focusing:
+    """Acoustophoresis of a suspension in a channel: velocities, paths across it, trigger times.
+
+    `axis` is 'y' or 'z' in all methods; positions must lie within the channel, else ValueError.
+
+    Raises
+    ------
+    TypeError
+        If an argument is not of its class.
+    ValueError
+        If the spheres do not fit into the channel, or the contrast factor is not above 0, so that sound
+        would push them to the walls.
+    """
+
+    channel: Channel = field(default_factory=Channel)
+    acoustics: Acoustics = field(default_factory=Acoustics)
+    suspension: Suspension = field(default_factory=Suspension)
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            _instance(item.name, getattr(self, item.name), item.type)
+        side, radius = min(self.channel.width_um, self.channel.height_um), self.suspension.radius_um
+        if 2 * radius >= side:
+            raise ValueError(f"radius_um: got {radius:g}, allowed is below {side / 2:g}, half the channel")
+        contrast = self.suspension.contrast_factor
+        if contrast <= 0:
+            raise ValueError(f"contrast_factor: got {contrast:.3g}, allowed is above 0: focusing")
+
+    def extent_um(self, axis: str) -> float:
+        """Channel extent along the axis: w or h."""
+        return {"y": self.channel.width_um, "z": self.channel.height_um}[choice("axis", axis, "yz")]
+
+    def free_um(self, axis: str) -> float:
+        """How far from the middle a particle's centre can be: half the extent less one radius."""
+        return self.extent_um(axis) / 2 - self.suspension.radius_um
+
+    def amplitude_um_s(self, axis: str) -> float:
+        """U = u_0 a²/a_0² of eq. (1a) for y, (1b) for z.
+
+        With u_0 = 4 E_ac / (ρ c) and a_0² = 6 ν / (Φ ω) (Muller et al., Phys. Rev. E 88 (2013) 023006) and
+        ω = k c, this is (2 Φ / 3) (a² / η) k E_ac; k = π / extent for a half wave.
+        """
+        k_per_m = np.pi / (self.extent_um(axis if self.acoustics.two_half_waves else "y") * 1e-6)
+        a2_over_eta = (self.suspension.radius_um * 1e-6) ** 2 / (self.suspension.viscosity_mPa_s * 1e-3)
+        energy = self.acoustics.energy_density_J_m3
+        return 2 / 3 * self.suspension.contrast_factor * a2_over_eta * k_per_m * energy * 1e6
+
+    def focusing_time_s(self, axis: str) -> float:
+        """Time in which tan(πy/w) falls by a factor e: w / (2πU)."""
+        return self.extent_um(axis) / (2 * np.pi * self.amplitude_um_s(axis))
+
+    def radiation_velocity(self, axis: str, position_um: ArrayLike) -> NDArray[np.float64]:
+        """Eqs (1a, 1b) in µm/s: U sin[π(2y/w + 1)], that is -U sin(2πy/w), towards the centre."""
+        extent = self.extent_um(axis)
+        position = _within("position_um", position_um, extent / 2)
+        return self.amplitude_um_s(axis) * np.sin(np.pi * (2 * position / extent + 1))
+
+    def path(self, axis: str, start_um: ArrayLike, t_s: ArrayLike) -> NDArray[np.float64]:
+        """Position in µm at `t_s` of particles that were at `start_um` at t = 0 (broadcast together).
+
+        Solves dy/dt = -U sin(2πy/w): tan(πy/w) = tan(πy_0/w) exp(-2πUt/w).
+        """
+        extent = self.extent_um(axis)
+        start = np.tan(np.pi / extent * _within("start_um", start_um, extent / 2))
+        return extent / np.pi * np.arctan(start * np.exp(-np.asarray(t_s) / self.focusing_time_s(axis)))
+
+    def arrival_time(self, axis: str, start_um: ArrayLike) -> NDArray[np.float64]:
+        """Time in s to reach the middle third from `start_um`: 0 inside it, inf from the wall itself."""
+        extent = self.extent_um(axis)
+        start = np.abs(_within("start_um", start_um, extent / 2))
+        ratio = np.maximum(np.tan(np.pi * start / extent) / np.tan(np.pi / 6), 1.0)
+        return np.where(start < extent / 2, self.focusing_time_s(axis) * np.log(ratio), np.inf)
+
+    def trigger_time(
+        self,
+        axis: str,
+        fraction: float = 0.9,
+        *,
+        start_um: ArrayLike | None = None,
+        wall_gap_um: float | None = None,
+    ) -> float:
+        """When `fraction` of the particles are in the middle third: t_{w/3} for 'y', t_{h/3} for 'z'.
+
+        Who starts nearer to the centre arrives first, so one particle decides: the one at that rank of
+        distance from the centre.
+
+        Parameters
+        ----------
+        axis : 'y' or 'z'
+        fraction : float
+            In (0, 1] (paper: 0.9).
+        start_um : array_like, optional
+            Start of each particle along `axis`. Without it: infinitely many, evenly spread.
+        wall_gap_um : float, optional
+            How far off the walls those keep; by default their radius. 0 is the whole cross-section.
+
+        Returns
+        -------
+        float
+            Seconds; inf if it never happens (fraction 1 without a gap).
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is out of range, or both `start_um` and `wall_gap_um` are given.
+        """
+        half = self.extent_um(axis) / 2
+        if not 0 < positive("fraction", fraction) <= 1:
+            raise ValueError(f"fraction: got {fraction!r}, allowed is above 0 to 1")
+        if start_um is None:
+            gap = self.suspension.radius_um if wall_gap_um is None else wall_gap_um
+            if positive("wall_gap_um", gap, zero=True) >= half:
+                raise ValueError(f"wall_gap_um: got {gap!r}, allowed is 0 to below {half:g}")
+            return float(self.arrival_time(axis, fraction * (half - gap)))
+        if wall_gap_um is not None:
+            raise ValueError(f"wall_gap_um: got {wall_gap_um!r}, allowed is None where start_um is given")
+        distance = np.sort(np.abs(_within("start_um", start_um, half)), axis=None)
+        if distance.size == 0:
+            raise ValueError("start_um: got no particle, allowed is one or more")
+        rank = max(int(np.ceil(fraction * distance.size - 1e-9)), 1)  # 0.7 * 10 is a little above 7
+        return float(self.arrival_time(axis, distance[rank - 1]))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trajectories:
+    """The paths of one population of particles; `Trajectories.seeded` draws one.
+
+    Attributes
+    ----------
+    focusing : Focusing
+    start : pandas.DataFrame
+        `particle, x_um, y_um, z_um` at t = 0, centres one radius or more off the walls. Copied.
+    duration_s : float
+        Positions are known from 0 to this time (paper: 20).
+    view_length_um : float
+        Length of the field of view (512 pixels of 0.65 µm).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is out of range, or `start` is empty, lacks a column or has NaN or a particle in a wall.
+    """
+
+    focusing: Focusing
+    start: pd.DataFrame
+    duration_s: float = 20.0
+    view_length_um: float = 332.8
+
+    def __post_init__(self) -> None:
+        _positive_fields(self)
+        _instance("focusing", self.focusing, Focusing)
+        _instance("start", self.start, pd.DataFrame)
+        columns = ["particle", "x_um", "y_um", "z_um"]
+        if not set(columns) <= set(self.start.columns):
+            raise ValueError(f"start: got columns {list(self.start.columns)}, allowed are {columns}")
+        if self.start.empty:
+            raise ValueError("start: got no particle, allowed is one or more")
+        _within("start x_um", self.start["x_um"], 1e9)
+        for axis in "yz":
+            _within(f"start {axis}_um", self.start[f"{axis}_um"], self.focusing.free_um(axis))
+        object.__setattr__(self, "start", self.start[columns].reset_index(drop=True))
+
+    @classmethod
+    def seeded(
+        cls,
+        focusing: Focusing,
+        rng: int | np.random.Generator,
+        *,
+        mean_in_view: float = 50.0,
+        duration_s: float = 20.0,
+        view_length_um: float = 332.8,
+        border_um: float = 30.0,
+    ) -> Self:
+        """Draw particles evenly over the cross-section, and along x from far enough upstream.
+
+        Far enough is the peak speed times `duration_s`. How far a particle drifts does not depend on its
+        start along x, so at any time the view holds an even draw of all paths: the count in it stays binomial
+        around `mean_in_view`, and its share in the middle thirds is that of the whole population.
+
+        Parameters
+        ----------
+        focusing : Focusing
+        rng : int or numpy.random.Generator
+            The same seed gives the same table, bit for bit.
+        mean_in_view : float
+            Expected number of particles in the field of view.
+        duration_s, view_length_um : float
+            As in the class.
+        border_um : float
+            The density also holds up to here beyond either end of the view, since a defocused particle just
+            outside the frame still lights its edge.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is out of range, or `mean_in_view` so small that there would be no particle.
+        """
+        _instance("focusing", focusing, Focusing)
+        if isinstance(rng, bool) or not isinstance(rng, Integral | np.random.Generator):
+            raise TypeError(f"rng: got {rng!r}, allowed is an integer seed or a numpy Generator")
+        if isinstance(rng, Integral) and rng < 0:
+            raise ValueError(f"rng: got {rng!r}, allowed is a seed of at least 0")
+        border = positive("border_um", border_um, zero=True)
+        drift = focusing.channel.max_speed_um_s * positive("duration_s", duration_s)
+        length = positive("view_length_um", view_length_um) + 2 * border + drift
+        count = round(positive("mean_in_view", mean_in_view) * length / view_length_um)
+        if count == 0:
+            least = view_length_um / length  # one particle in all
+            raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed is {least:.2g} or more")
+        half = [focusing.free_um("y"), focusing.free_um("z")]
+        low, high = [-border - drift, -half[0], -half[1]], [view_length_um + border, *half]
+        xyz = np.random.default_rng(rng).uniform(low, high, size=(count, 3))
+        start = pd.DataFrame(xyz, columns=["x_um", "y_um", "z_um"]).assign(particle=np.arange(count))
+        return cls(focusing=focusing, start=start, duration_s=duration_s, view_length_um=view_length_um)
+
+    @cached_property
+    def _drift(self) -> PPoly:
+        """How far each particle has gone along x, as a piecewise polynomial of time.
+
+        The flow's velocity is taken along the closed-form path across, splined and integrated. Knots follow
+        the faster axis until it is focused to 1e-11, then the slower one; after that nothing changes.
+        """
+        scale = np.sort([self.focusing.focusing_time_s(axis) for axis in "yz"])
+        ends = [0.0, *np.minimum(25 * scale, self.duration_s), self.duration_s]
+        steps = [*scale / _KNOTS, self.duration_s / _KNOTS]
+        parts = zip(ends[:-1], ends[1:], steps, strict=True)
+        pieces = [np.linspace(a, b, 2 + int((b - a) / step)) for a, b, step in parts]
+        t = np.unique(np.concatenate(pieces))
+        return CubicSpline(t, self.focusing.channel.velocity(*self._across(t))).antiderivative()
+
+    def _across(self, t_s: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """y and z, each of shape (times, particles)."""
+        return [self.focusing.path(axis, self.start[f"{axis}_um"], t_s[:, None]) for axis in "yz"]
+
+    def table(self, times_s: ArrayLike, *, border_um: float = 0.0) -> pd.DataFrame:
+        """Positions at many times.
+
+        Parameters
+        ----------
+        times_s : array_like, shape (frames,)
+            From 0 to `duration_s`.
+        border_um : float
+            Keep particles up to here beyond either end of the view (the density holds up to the border given
+            to `seeded`); inf: every one, wherever it is.
+
+        Returns
+        -------
+        pandas.DataFrame
+            `frame` (index into `times_s`), `particle, t_s, x_um, y_um, z_um`, sorted by frame.
+
+        Raises
+        ------
+        ValueError
+            If a time or the border is out of range.
+        """
+        t = np.asarray(times_s, dtype=float)
+        if t.ndim != 1 or not np.all((t >= 0) & (t <= self.duration_s)):
+            raise ValueError(f"times_s: got {times_s!r}, allowed are one axis, 0 to {self.duration_s:g} s")
+        border = border_um if border_um == np.inf else positive("border_um", border_um, zero=True)
+        x = self.start["x_um"].to_numpy() + self._drift(t)
+        y, z = self._across(t)
+        frame, row = np.nonzero((x >= -border) & (x <= self.view_length_um + border))
+        columns = {"frame": frame, "particle": self.start["particle"].to_numpy()[row], "t_s": t[frame]}
+        xyz = {"x_um": x[frame, row], "y_um": y[frame, row], "z_um": z[frame, row]}
+        return pd.DataFrame(columns | xyz)
+
+    def positions(self, t_s: float, *, border_um: float = 0.0) -> pd.DataFrame:
+        """Positions at one time, about 1 ms each: the columns of `table` but for `frame`."""
+        return self.table([t_s], border_um=border_um).drop(columns="frame")
+
+    def trigger_time(self, axis: str, fraction: float = 0.9) -> float:
+        """Exact trigger time in s of all these particles, in view or not: see `Focusing.trigger_time`."""
+        return self.focusing.trigger_time(axis, fraction, start_um=self.start[f"{axis}_um"])

@@ -1,0 +1,551 @@
+"""The real-time experiment: evaluate a film once, then replay camera and monitor as often as wanted.
+
+A monitor takes the camera's newest frame as soon as it is free, is busy for the evaluation time τ, then takes
+the newest again; frames in between are dropped. It fires when 90 % of the particles it measured are in the
+middle third of the height (trigger 'h', the paper's t_{h/3}) or of the width ('w', t_{w/3}).
+
+What a frame's evaluation finds does not depend on τ. So `sweep` evaluates the frames of many films in many
+ways, each frame rendered once for all of them, and keeps what it found on disk; `watch` is the clock; `errors`
+lets it run over that table for any τ and any moment of switching on.
+
+Any function with the signature of `locate` can be the evaluator: here nothing is known of how it works.
+"""
+
+import hashlib
+import inspect
+import sys
+import time
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import pandas as pd
+from joblib import Parallel, delayed
+from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
+
+from gdptlab._checks import positive, whole
+from gdptlab._files import cache_folder, written_whole
+from gdptlab.experiment.film import Film
+from gdptlab.experiment.trigger import fractions, trigger_time
+
+VERSION = 6
+"""Part of every cache key: to be raised when films, or what an evaluator calls, give other results."""
+
+_BLOCK = 25  # frames per job: long against what it costs to hand a job to a worker
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Method:
+    """One way to evaluate a frame.
+
+    Attributes
+    ----------
+    evaluator : callable
+        (image, calibration, **settings) -> DataFrame with at least `x_px`, `y_px`, `z_um`, like `locate`.
+    calibration : object
+        Whatever the evaluator takes.
+    settings : mapping
+        Its keyword arguments.
+    label : mapping
+        Columns, and their values, by which tables tell this method from others.
+    """
+
+    evaluator: Callable[..., pd.DataFrame]
+    calibration: Any = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    label: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not callable(self.evaluator):
+            raise TypeError(f"evaluator: got {self.evaluator!r}, allowed is a function like locate")
+
+    def __call__(self, image: NDArray) -> pd.DataFrame:
+        """Evaluate one frame.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the evaluator returns no table, one without a column that is needed, or one that holds anything
+            but numbers.
+        """
+        table = self.evaluator(image, self.calibration, **self.settings)
+        if not isinstance(table, pd.DataFrame):
+            raise TypeError(f"evaluator: got a {type(table).__name__} from it, allowed is a DataFrame")
+        if not {"x_px", "y_px", "z_um"} <= set(table):
+            raise ValueError(f"evaluator: got columns {list(table)} from it, needed are x_px, y_px and z_um")
+        if len(table) == 0:
+            return table.astype({name: float for name, dtype in table.dtypes.items() if dtype.kind == "O"})
+        if not all(dtype.kind in "buif" for dtype in table.dtypes):
+            raise TypeError(f"evaluator: got {dict(table.dtypes)} from it, allowed are columns of numbers")
+        return table
+
+
+def grid(
+    evaluator: Callable[..., pd.DataFrame],
+    calibrate: Callable[..., Any],
+    *,
+    n: Iterable[int] = (51, 26, 11, 6),
+    n_sub: Iterable[int] = (11, 9, 6, 4),
+    refine: Iterable[bool] = (True, False),
+    **settings: Any,
+) -> list[Method]:
+    """Methods of the paper's Figure 5 (a-c): all combinations with n_sub ≤ n.
+
+    Parameters
+    ----------
+    evaluator : callable
+        `locate`, or one that also has the setting `refine`.
+    calibrate : callable
+        Called as calibrate(n=..., n_sub=...), for example `partial(Calibration.from_stack, stack, z_um)`.
+    n, n_sub, refine : iterables
+        N, N_sub, and whether the refinement step is done.
+    **settings
+        Of the evaluator, the same for all.
+
+    Returns
+    -------
+    list of Method
+        With labels `n`, `n_sub`, `refine`.
+    """
+    refine = list(refine)
+    pairs = [(a, b) for a in n for b in n_sub if b <= a]
+    calibrations = {pair: calibrate(n=pair[0], n_sub=pair[1]) for pair in pairs}
+    return [
+        Method(
+            evaluator=evaluator,
+            calibration=calibrations[pair],
+            settings={"refine": r, **settings},
+            label={"n": pair[0], "n_sub": pair[1], "refine": r},
+        )
+        for pair in pairs
+        for r in refine
+    ]
+
+
+def evaluate(
+    film: Film,
+    methods: Sequence[Method],
+    *,
+    every: int = 1,
+    n_jobs: int = 1,
+    cache: bool = True,
+    progress: bool = True,
+) -> list[pd.DataFrame]:
+    """Evaluate a film in several ways, each frame rendered once.
+
+    Parameters
+    ----------
+    film : Film
+    methods : sequence of Method
+    every : int
+        Evaluate only every so many frames: a slower camera.
+    n_jobs : int
+        Processes; -1 for one per core. The result does not depend on it.
+    cache : bool
+        Look for each method's table in the cache folder, and put it there.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    list of DataFrame
+        For each method `frame` (its number in the film) and the columns of its evaluator.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not of its form, an evaluator returns no such table, or, with `cache`, a part of a
+        method cannot be told from another by its value.
+    """
+    if n_jobs != -1:
+        whole("n_jobs", n_jobs, 1, 10_000)
+    for method in methods:
+        if not isinstance(method, Method):
+            raise TypeError(f"methods: got {method!r} in it, allowed are Methods")
+    frames = evaluated_frames(film, every)
+    paths = [_cache_path(film, method, frames) if cache else None for method in methods]
+    tables = [_load(path) if path else None for path in paths]
+    missing = [i for i, table in enumerate(tables) if table is None]
+    if not missing:
+        return tables
+    todo = [methods[i] for i in missing]
+    # The first frame here, so that workers get calibrations whose lazy parts are there already.
+    parts = [_evaluated(film, todo, frames[:1])]
+    blocks = [frames[k : k + _BLOCK] for k in range(1, len(frames), _BLOCK)]
+    jobs = Parallel(n_jobs=n_jobs, return_as="generator")(delayed(_evaluated)(film, todo, block) for block in blocks)
+    with tqdm(total=len(frames), initial=1, desc="frames", unit="frame", leave=False, disable=not progress) as bar:
+        for block, part in zip(blocks, jobs, strict=True):
+            parts.append(part)
+            bar.update(len(block))
+    for i, *pieces in zip(missing, *parts, strict=True):
+        columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+        if paths[i]:
+            with written_whole(paths[i]) as temporary:
+                np.savez_compressed(temporary, **columns)
+        tables[i] = pd.DataFrame(columns)
+    return tables
+
+
+def evaluated_frames(film: Film, every: int = 1) -> NDArray[np.int64]:
+    """Numbers of the frames that `evaluate` looks at."""
+    return np.arange(0, len(film), whole("every", every, 1, len(film)))
+
+
+def _evaluated(film: Film, methods: Sequence[Method], frames: NDArray[np.int64]) -> list[dict[str, NDArray]]:
+    """Columns of each method's table over some frames."""
+    found: list[list[pd.DataFrame]] = [[] for _ in methods]
+    for frame in frames.tolist():
+        image = film[frame]
+        for tables, method in zip(found, methods, strict=True):
+            tables.append(method(image))
+    return [
+        {"frame": np.repeat(frames, [len(t) for t in tables])}
+        | {name: np.concatenate([t[name].to_numpy() for t in tables]) for name in tables[0] if name != "frame"}
+        for tables in found
+    ]
+
+
+def _load(path: Path) -> pd.DataFrame | None:
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            return pd.DataFrame({name: file[name] for name in file.files})
+    except (OSError, ValueError, EOFError, BadZipFile, zlib.error):  # not there, or damaged
+        return None
+
+
+def _cache_path(film: Film, method: Method, frames: NDArray[np.int64]) -> Path:
+    """Where a table is kept: under a hash of all that it depends on."""
+    digest = hashlib.sha256()
+    evaluator = method.evaluator
+    for part in (VERSION, film, frames, _source(evaluator), method.calibration, method.settings):
+        _feed(digest, part)
+    folder = cache_folder() / "replay"
+    folder.mkdir(exist_ok=True)
+    return folder / f"{digest.hexdigest()[:32]}.npz"
+
+
+def _source(evaluator: Callable) -> tuple[str, str]:
+    """Name and code of a function (its whole module, unless that is a notebook)."""
+    try:
+        module = sys.modules[evaluator.__module__]
+        return evaluator.__qualname__, inspect.getsource(module if hasattr(module, "__file__") else evaluator)
+    except (AttributeError, KeyError, OSError, TypeError) as error:
+        raise TypeError(f"evaluator: got {evaluator!r}, allowed is a plain function, or cache=False") from error
+
+
+def _feed(digest: Any, value: Any) -> None:
+    """Add a value to a hash such that equal values give equal hashes, in any process."""
+    if isinstance(value, pd.DataFrame):
+        value = {name: value[name].to_numpy() for name in value}
+    digest.update(f"({type(value).__name__}".encode())
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {f.name: getattr(value, f.name) for f in fields(value) if not f.name.startswith("_")}
+    if isinstance(value, Mapping):
+        value = [item for name in sorted(value) for item in (name, value[name])]
+    if isinstance(value, np.ndarray) and value.dtype.kind != "O":
+        digest.update(repr((value.dtype.str, value.shape)).encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, list | tuple):
+        for item in value:
+            _feed(digest, item)
+    elif value is None or isinstance(value, str | bool | int | float | np.number | np.bool_):
+        digest.update(repr(value).encode())
+    else:
+        raise TypeError(
+            f"method: got {value!r} in it, allowed are numbers, text, arrays and dataclasses, or cache=False"
+        )
+    digest.update(b")")
+
+
+def durations(film: Film, methods: Sequence[Method], *, count: int = 20, progress: bool = True) -> pd.DataFrame:
+    """Measure evaluation times τ, one frame after another in this process, with nothing else running in it.
+
+    Times taken while other processes evaluate would be longer, so `evaluate` takes none.
+
+    Parameters
+    ----------
+    film : Film
+    methods : sequence of Method
+    count : int
+        Frames, spread evenly over the film. The first is evaluated once before, untimed, as a warm-up.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    DataFrame
+        The methods' labels, `frame`, and `tau_s`, the wall time.
+    """
+    frames = np.unique(np.linspace(0, len(film) - 1, whole("count", count, 1, 10_000)).astype(int)).tolist()
+    for method in methods:
+        method(film[frames[0]])
+    rows = []
+    for frame in tqdm(frames, desc="timed", unit="frame", leave=False, disable=not progress):
+        image = film[frame]
+        for method in methods:
+            start = time.perf_counter()
+            method(image)
+            rows.append({**method.label, "frame": frame, "tau_s": time.perf_counter() - start})
+    return pd.DataFrame(rows)
+
+
+def sweep(
+    films: Iterable[Film],
+    methods: Sequence[Method],
+    *,
+    every: int = 1,
+    level: float = 0.9,
+    n_jobs: int = 1,
+    cache: bool = True,
+    progress: bool = True,
+) -> pd.DataFrame:
+    """Evaluate many films in many ways, and say what the monitor would see in each frame.
+
+    A sweep that was stopped goes on, when called again, at the film it was at.
+
+    Parameters
+    ----------
+    films : iterable of Film
+        Told apart by `seed` and `image_type`. All are evaluated by the same methods.
+    methods : sequence of Method
+    every, n_jobs, cache, progress
+        As in `evaluate`.
+    level : float
+        Fraction that triggers, in (0, 1] (paper: 0.9).
+
+    Returns
+    -------
+    DataFrame
+        A row for each film, method and evaluated frame:
+
+        * `seed`, `image_type`, and the labels of the method;
+        * `frame`, `t_s`; `count`, `fraction_h`, `fraction_w` of the particles measured (see `fractions`);
+        * `true_count`, `true_fraction_h`, `true_fraction_w` of those whose centre is in the frame;
+        * `level`; `true_h_s`, `true_w_s`: first of *all* frames of the film, evaluated or not, at which the
+          true fraction reaches it (NaN: never).
+    """
+    films = list(films)
+    names = [(film.seed, film.image_type) for film in films]
+    if len(set(names)) < len(names):
+        raise ValueError(f"films: got {names}, allowed are films that differ in seed or image_type")
+    if not films or not methods:
+        raise ValueError(f"films, methods: got {len(films)} and {len(methods)}, allowed are one or more")
+    parts = []
+    for film in tqdm(films, desc="films", unit="film", disable=not progress):
+        channel, frames = film.trajectories.focusing.channel, evaluated_frames(film, every)
+        truth = fractions(film.to_channel(film.truth()), np.arange(len(film)), channel).drop(columns="frame")
+        triggers = {f"true_{a}_s": trigger_time(film.times_s, truth[f"fraction_{a}"], level) for a in "hw"}
+        seen = truth.iloc[frames].add_prefix("true_").reset_index(drop=True)
+        name = {"seed": film.seed, "image_type": film.image_type}
+        bar = progress and len(films) == 1  # one bar is enough
+        tables = evaluate(film, methods, every=every, n_jobs=n_jobs, cache=cache, progress=bar)
+        for method, table in zip(methods, tables, strict=True):
+            monitor = fractions(film.to_channel(table), frames, channel)
+            monitor.insert(1, "t_s", film.times_s[frames])
+            labels = pd.DataFrame({**name, **method.label}, index=monitor.index)
+            parts.append(pd.concat([labels, monitor, seen], axis=1).assign(level=level, **triggers))
+    return pd.concat(parts, ignore_index=True)
+
+
+def watch(times_s: ArrayLike, tau_s: ArrayLike, phase_s: float = 0.0) -> pd.DataFrame:
+    """Which frames a monitor evaluates: the newest when it is free, then busy, then the newest again.
+
+    If there is no newer frame than the last it had, it waits for one. It stops where the film does.
+
+    Parameters
+    ----------
+    times_s : array (n,)
+        When frames arrive, increasing.
+    tau_s : float or array (n,)
+        Evaluation time, of any frame or of each.
+    phase_s : float
+        When the monitor is switched on.
+
+    Returns
+    -------
+    DataFrame
+        `index` into `times_s` and `t_s` of each frame used; `decision_s`, when its evaluation ends;
+        `dropped`, how many frames between it and the one used before nobody saw.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If τ is not above 0, the phase negative, or the times do not increase.
+    """
+    times = np.asarray(times_s, dtype=float)
+    if times.ndim != 1 or not len(times) or not (np.diff(times) > 0).all():
+        raise ValueError(f"times_s: got {times_s!r}, allowed are one or more increasing times")
+    if np.ndim(tau_s) == 0:
+        tau = np.full(len(times), positive("tau_s", tau_s))
+    else:
+        tau = np.asarray(tau_s, dtype=float)
+        if tau.shape != times.shape or not (np.isfinite(tau) & (tau > 0)).all():
+            raise ValueError(
+                f"tau_s: got {tau_s!r}, allowed is a number above 0, or one for each of {len(times)} frames"
+            )
+    end = times[-1] + (times[-1] - times[-2] if len(times) > 1 else np.inf)
+    now, last, rows = positive("phase_s", phase_s, zero=True), -1, []
+    while now < end - 1e-9:
+        newest = int(np.searchsorted(times, now + 1e-9, side="right")) - 1  # but for rounding, times[newest] <= now
+        if newest == last:
+            if last == len(times) - 1:
+                break
+            newest = last + 1
+        start = max(now, times[newest])
+        now = start + tau[newest]
+        rows.append((newest, times[newest], now, newest - last - 1 if rows else 0))
+        last = newest
+    table = pd.DataFrame(rows, columns=["index", "t_s", "decision_s", "dropped"])
+    return table.astype({"index": int, "t_s": float, "decision_s": float, "dropped": int})
+
+
+def expected_delay(tau_s: ArrayLike, camera_s: float = 0.04, truth_s: float | None = None) -> pd.DataFrame:
+    """Delay that a monitor which measures perfectly has by chance: the grey area of Figure 5.
+
+    The true trigger is at a frame of the film, at T. From then on the monitor looks out for the first evaluation
+    that starts at or after the first frame it can see, T + A. Switched on at a random moment, it starts one at
+    T + A + U, with U even over 0 to τ, and takes the newest frame there is: T + A + d floor(U / d), where d is
+    the time between frames it can see. If τ < d it waits for each of them, and the delay is A alone. A is 0 where
+    it can see every frame; where only every k-th is evaluated, A is one of 0, d/k, ... (k - 1) d/k, all as likely.
+    The moment of decision is later by one τ, and by the frame's age, U - d floor(U / d), on top.
+
+    Parameters
+    ----------
+    tau_s : float or array (n,)
+        Evaluation times.
+    camera_s : float
+        Time between the frames that are evaluated, d.
+    truth_s : float, optional
+        Time between the frames of the film, d / k; d if not given.
+
+    Returns
+    -------
+    DataFrame
+        `tau_s`; `mean_s`, `low_s` and `high_s`: mean, smallest and largest delay of the frame's timestamp.
+    """
+    tau = np.atleast_1d(np.asarray(tau_s, dtype=float))
+    for value in tau.tolist():
+        positive("tau_s", value)
+    d = positive("camera_s", camera_s)
+    fine = d if truth_s is None else positive("truth_s", truth_s)
+    if abs(d / fine - round(d / fine)) > 1e-6 or round(d / fine) < 1:
+        raise ValueError(f"truth_s: got {fine:g}, allowed is a whole part of camera_s = {d:g}")
+    full = np.floor(tau / d + 1e-9)  # steps of the staircase d floor(U / d) that are whole
+    mean = d * (full * (full - 1) / 2 * d + full * np.maximum(tau - full * d, 0)) / tau
+    high = d * np.maximum(np.ceil(tau / d - 1e-9) - 1, 0)
+    return pd.DataFrame({"tau_s": tau, "mean_s": mean + (d - fine) / 2, "low_s": 0.0, "high_s": high + d - fine})
+
+
+def errors(
+    table: pd.DataFrame, tau_s: ArrayLike | None = None, *, phases: int = 8, limit_s: float = 1.0
+) -> pd.DataFrame:
+    """Let the monitor run over evaluated films: how wrong are its trigger times?
+
+    Parameters
+    ----------
+    table : DataFrame
+        From `sweep`.
+    tau_s : float or array, optional
+        Evaluation times to impose. Without it, the table's own column `tau_s`, which can differ from method to
+        method and from frame to frame.
+    phases : int
+        Moments of switching on, evenly over one τ (or the time between frames, if that is longer).
+    limit_s : float
+        A trigger fails that is off by more than this, beyond the clock's own delay.
+
+    Returns
+    -------
+    DataFrame
+        A row for each film, method, τ, phase and trigger:
+
+        * `seed`, `image_type`, labels; `tau_s` (the mean, where it differs from frame to frame), `phase_s`;
+          `trigger`, 'h' or 'w'; `true_s`, the film's true trigger time;
+        * `error_s`: timestamp of the first frame used that reaches the level, minus `true_s`;
+          `decision_error_s`: the moment of decision minus `true_s`; both NaN where `fired` is False;
+        * `delay_s`: the error of the same clock with true positions; `own_error_s` = `error_s` - `delay_s`;
+        * `dropped`: frames dropped until then (or the film's end);
+        * `fired`; `possible`, whether the clock would fire with true positions before the film ends;
+          `failed`: it was possible, but the monitor never fired or its own error is beyond ± `limit_s`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is out of range, or there is no τ.
+    """
+    whole("phases", phases, 1, 10_000)
+    positive("limit_s", limit_s)
+    if tau_s is None and "tau_s" not in table:
+        raise ValueError("tau_s: got None, allowed is a number above 0 where the table has no column tau_s")
+    keys = [name for name in table.columns[: table.columns.get_loc("frame")] if name != "tau_s"]
+    clocks: dict[tuple, tuple] = {}
+    rows = []
+    for key, part in table.groupby(keys, sort=False):
+        times = part["t_s"].to_numpy()
+        seen = part[["fraction_h", "fraction_w", "true_fraction_h", "true_fraction_w"]].to_numpy().T
+        seen, true = seen >= part["level"].iloc[0], part[["true_h_s", "true_w_s"]].iloc[0].tolist()
+        for tau in [part["tau_s"].to_numpy()] if tau_s is None else np.atleast_1d(tau_s).tolist():
+            for k in range(phases):
+                name = (times.tobytes(), np.asarray(tau).tobytes(), k)
+                if name not in clocks:
+                    clocks[name] = _clock(times, tau, (k + 0.5) / phases)
+                mean, phase, index, t, decision, dropped = clocks[name]
+                hit = seen[:, index]
+                ever, first = hit.any(axis=1).tolist(), hit.argmax(axis=1).tolist()
+                for i, trigger in enumerate("hw"):
+                    j, fired, ideal = first[i], ever[i], ever[i + 2]
+                    error, decided = (t[j] - true[i], decision[j] - true[i]) if fired else (np.nan, np.nan)
+                    delay = t[first[i + 2]] - true[i] if ideal else np.nan
+                    off = not abs(error - delay) <= limit_s  # so, too, if there is no error
+                    result = (true[i], error, delay, error - delay, decided, dropped[j if fired else -1])
+                    rows.append((*key, mean, phase, trigger, *result, fired, ideal, ideal and off))
+    columns = ["tau_s", "phase_s", "trigger", "true_s", "error_s", "delay_s", "own_error_s", "decision_error_s"]
+    return pd.DataFrame(rows, columns=[*keys, *columns, "dropped", "fired", "possible", "failed"])
+
+
+def _clock(times: NDArray, tau: float | NDArray, share: float) -> tuple:
+    """Mean τ, phase, and the columns of `watch` (frames dropped so far) as lists, but for the index."""
+    mean = float(np.mean(tau))
+    phase = share * (max(mean, times[1] - times[0]) if len(times) > 1 else mean)
+    used = watch(times, tau, phase)
+    lists = (used["t_s"].tolist(), used["decision_s"].tolist(), used["dropped"].cumsum().tolist())
+    return mean, phase, used["index"].to_numpy(), *lists
+
+
+def summary(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """Median and quartiles of trigger errors, never without the number of those that are not in them.
+
+    Parameters
+    ----------
+    table : DataFrame
+        From `errors`.
+    by : sequence of str
+        Columns to group by; 'trigger' should be among them.
+
+    Returns
+    -------
+    DataFrame
+        `by`; `films`; `replays` that were possible; of these `never` (did not fire) and `failed` (those, and the
+        ones beyond the limit); `impossible`, not among them: the film ends too early. For `error_s` and
+        `own_error_s` of all possible ones that fired: `..._median`, `..._q25`, `..._q75` (NaN where none did).
+    """
+    rows = []
+    for key, part in table.groupby(list(by), sort=False):
+        possible = part[part["possible"]]
+        fired = possible[possible["fired"]]
+        row = dict(zip(by, key, strict=True)) | {
+            "films": len(part[["seed", "image_type"]].drop_duplicates()),
+            "replays": len(possible),
+            "never": len(possible) - len(fired),
+            "failed": int(possible["failed"].sum()),
+            "impossible": len(part) - len(possible),
+        }
+        for name in ("error_s", "own_error_s"):
+            for suffix, q in {"median": 0.5, "q25": 0.25, "q75": 0.75}.items():
+                row[f"{name}_{suffix}"] = fired[name].quantile(q)
+        rows.append(row)
+    return pd.DataFrame(rows)

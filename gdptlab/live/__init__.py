@@ -1,0 +1,14 @@
+"""A monitor beside a running camera, and a simulated device to try it on."""
+
+import lazy_loader
+
+# Each module is imported when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "monitor": ["Frame", "MiddleThird", "Monitor", "Result", "Status", "Trigger", "at_speed", "middle_thirds"],
+        "device": ["Device", "Switched", "closed_loop", "switched", "timed", "true_shares"],
+        "own_process": ["OwnProcess"],
+        "logbook": ["Logbook", "read_log"],
+    },
+)

@@ -1,0 +1,610 @@
+"""A monitor beside a running camera: it looks at the newest frame, decides, acts, and writes down what it saw.
+
+Two threads share one slot. One takes frames from the source as they come and puts each into the slot, on top of
+what is there; the other takes what is in the slot, evaluates it, and decides. So the camera never waits, memory is
+that of two or three frames however fast it is, and what is evaluated is always the newest; a frame that is
+overwritten before anyone saw it is dropped, and counted. The clock of `replay.watch` is the same thing on paper.
+
+Nothing that goes wrong with a frame stops the loop: it is counted, written to the log, and the next one is taken.
+
+A thread shares Python's interpreter with whatever else the program does, such as drawing. An evaluator wrapped in
+`OwnProcess` works in another process, and drawing delays it no more than a busy core would.
+
+All times are those of `time.perf_counter`, which is one clock for all processes of a machine.
+"""
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from threading import Condition, Event, Lock, Thread, current_thread
+from time import perf_counter, sleep
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from gdptlab._checks import choice, positive, real_array, whole
+from gdptlab.experiment.channel import Channel
+from gdptlab.experiment.trigger import in_middle_third
+from gdptlab.live.logbook import Logbook
+from gdptlab.live.own_process import as_text
+
+DIGITS = 3
+"""Decimals of a particle's numbers in the log."""
+
+# -------------------- what goes in
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame, and when the camera delivered it.
+
+    Attributes
+    ----------
+    image : array (rows, columns)
+    t_s : float
+        On the clock of `time.perf_counter`.
+    """
+
+    image: ArrayLike
+    t_s: float
+
+
+def at_speed(frames: Iterable[ArrayLike], rate_hz: float) -> Iterator[ArrayLike]:
+    """Hand out frames at true speed: the first at once, frame i at i / rate_hz, none before its time.
+
+    Parameters
+    ----------
+    frames : iterable of arrays (rows, columns)
+        Such as a `Film`; if one is not ready in time it comes late, and so may those that follow.
+    rate_hz : float
+
+    Yields
+    ------
+    array (rows, columns)
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the rate is not a number above 0.
+    """
+    period_s = 1 / positive("rate_hz", rate_hz)
+
+    def paced() -> Iterator[ArrayLike]:
+        start = perf_counter()
+        for i, frame in enumerate(frames):
+            sleep(max(start + i * period_s - perf_counter(), 0))
+            yield frame
+
+    return paced()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MiddleThird:
+    """Share of the particles in the middle third of the channel's height or width: the paper's two triggers.
+
+    Attributes
+    ----------
+    of : str
+        'h' (|z| ≤ h/6) or 'w' (|y| ≤ w/6), as in `replay.fractions`.
+    channel : Channel
+    to_channel : callable
+        Table of an evaluator -> the same with `y_um` and `z_um`, measured from the channel's middle; for example
+        `Film.to_channel`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a field is not of its kind.
+    """
+
+    of: str
+    channel: Channel
+    to_channel: Callable[[pd.DataFrame], pd.DataFrame]
+
+    def __post_init__(self) -> None:
+        choice("of", self.of, "hw")
+        if not isinstance(self.channel, Channel):
+            raise TypeError(f"channel: got {self.channel!r}, allowed is a Channel")
+        _function("to_channel", self.to_channel)
+
+    def __call__(self, table: pd.DataFrame) -> float:
+        """Share, from 0 to 1; NaN without particles."""
+        inside = in_middle_third(self.to_channel(table), self.of, self.channel)
+        return float(inside.mean()) if len(inside) else np.nan
+
+
+def middle_thirds(channel: Channel, to_channel: Callable[[pd.DataFrame], pd.DataFrame]) -> dict[str, MiddleThird]:
+    """Of height and width, by 'h' and 'w': two that convert a frame's table once.
+
+    Parameters
+    ----------
+    channel, to_channel
+        As of `MiddleThird`.
+
+    Raises
+    ------
+    TypeError
+        If one is not of its kind.
+    """
+    _function("to_channel", to_channel)
+    last: tuple[pd.DataFrame | None, pd.DataFrame | None] = (None, None)
+
+    def converted(table: pd.DataFrame) -> pd.DataFrame:
+        nonlocal last
+        if table is not last[0]:
+            last = table, to_channel(table)
+        return last[1]
+
+    return {of: MiddleThird(of=of, channel=channel, to_channel=converted) for of in "hw"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trigger:
+    """When to act.
+
+    It goes on with the first frame whose share is at or above `level`, and off again with the first whose share is
+    below `release`. Between the two, and in a frame with fewer than `least` particles, it stays as it is.
+
+    Attributes
+    ----------
+    name : str
+    share : callable
+        Table of the evaluator -> number, such as a `MiddleThird`. A NaN changes nothing.
+    action : callable
+        Called with the `Result` when the trigger goes on, in the evaluating thread: the next frame waits for it.
+    released : callable, optional
+        Likewise when it goes off.
+    level : float
+        (Paper: 0.9.)
+    release : float
+        At most `level`.
+    least : int
+        Particles that a frame must have.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a field is not of its kind or out of range.
+    """
+
+    name: str
+    share: Callable[[pd.DataFrame], float]
+    action: Callable[["Result"], object]
+    released: Callable[["Result"], object] | None = None
+    level: float = 0.9
+    release: float = 0.8
+    least: int = 5
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise TypeError(f"name: got {self.name!r}, allowed is a word")
+        for part in ("share", "action", "released"):
+            if part != "released" or self.released is not None:
+                _function(part, getattr(self, part))
+        positive("level", self.level)
+        if positive("release", self.release, zero=True) > self.level:
+            raise ValueError(f"release: got {self.release:g}, allowed is up to level, {self.level:g}")
+        whole("least", self.least, 0, 2**31)
+
+    def after(self, on: bool, share: float, count: int) -> bool:
+        """Whether it is on after a frame, given whether it was on before."""
+        if count < self.least:
+            return on
+        return bool(share >= (self.release if on else self.level) or (on and np.isnan(share)))
+
+
+def _function(name: str, value: Any) -> None:
+    if not callable(value):
+        raise TypeError(f"{name}: got {value!r}, allowed is a function")
+
+
+# -------------------- what comes out
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Result:
+    """What the monitor made of one frame.
+
+    Attributes
+    ----------
+    frame : int
+        Its number among all that the source delivered, from 0.
+    t_s, decision_s : float
+        When it was delivered, and when it was decided what it means.
+    dropped : int
+        Frames that nobody saw between this one and the one looked at before.
+    image : array (rows, columns), or what else came
+    table : DataFrame
+        From the evaluator; without rows if there is an error.
+    share : dict
+        Of each trigger, by name; empty if there is an error.
+    on : dict
+        Which triggers are on now.
+    changed : tuple of str
+        Those that went on or off with this frame.
+    error : str
+        Why it could not be evaluated; empty if it could.
+    """
+
+    frame: int
+    t_s: float
+    decision_s: float
+    dropped: int
+    image: Any
+    table: pd.DataFrame
+    share: dict[str, float]
+    on: dict[str, bool]
+    changed: tuple[str, ...] = ()
+    error: str = ""
+
+    @property
+    def latency_ms(self) -> float:
+        """From the frame's delivery to the decision."""
+        return 1e3 * (self.decision_s - self.t_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """How a monitor is doing.
+
+    Rates and latencies are of the last frames only, as many as the monitor's `window`.
+
+    Attributes
+    ----------
+    state : str
+        'ready', 'running', 'ended' (the source did, and all is evaluated) or 'stopped'.
+    grabbed, evaluated, failed, dropped : int
+        Frames that came; that were evaluated; that could not be; that nobody saw. Up to two more are under way.
+    camera_hz, rate_hz : float
+        Frames that came, and that were looked at, in a second; NaN before there are two.
+    latency_median_ms, latency_p99_ms, latency_max_ms : float
+        From a frame's delivery to the decision; NaN before the first.
+    waiting_s : float
+        Since the last frame came, or the start.
+    count : int
+        Particles in the last frame that was evaluated.
+    share, on : dict
+        Of each trigger, by name.
+    actions_failed : int
+        Actions of triggers that raised.
+    error : str
+        The last there was, of a frame, an action or the source; empty if there was none.
+    log_written, log_waiting, log_lost : int
+        Lines on the disk, on the way there, and lost.
+    log_problem : str
+        Why the log cannot be written at present; empty if it can.
+    """
+
+    state: str
+    grabbed: int
+    evaluated: int
+    failed: int
+    dropped: int
+    camera_hz: float
+    rate_hz: float
+    latency_median_ms: float
+    latency_p99_ms: float
+    latency_max_ms: float
+    waiting_s: float
+    count: int
+    share: dict[str, float]
+    on: dict[str, bool]
+    actions_failed: int
+    error: str
+    log_written: int
+    log_waiting: int
+    log_lost: int
+    log_problem: str
+
+
+# -------------------- the loop
+
+
+class Monitor:
+    """Look at the newest frame of a source, decide, act, write it down, and take the newest again.
+
+    Use it in a `with` block, which stops it at the end, or `start` and `stop` it.
+
+    Parameters
+    ----------
+    source : object
+        Of frames: a camera with a method `grab`, or a function, either of which is called for one frame after the
+        other and waits until there is one (None: no more); or anything to loop over, such as `at_speed(film, 25)`.
+        A frame is an array, whose time is the moment it comes, or a `Frame`, which brings its own.
+    evaluate : callable
+        image -> DataFrame with a row for each particle: a `replay.Method`, `functools.partial(locate,
+        calibration=...)`, or an `OwnProcess` around one of these.
+    triggers : sequence of Trigger
+    log : str or path-like, optional
+        File to which a line is added for each frame looked at (see `logbook`).
+    log_particles : bool
+        Put the particles into the log, too: about 3 kB for 100 of them.
+    example : array (rows, columns), optional
+        A frame like those to come. It is evaluated at the start, so that what is made at first use is there when
+        the first frame comes; and frames of another shape are refused. Without it the first frame sets the shape.
+    window : int
+        Frames that rates, latencies and `recent` go back.
+
+    Attributes
+    ----------
+    started_s : float
+        When it began to take frames; NaN before.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not of its kind.
+    """
+
+    def __init__(
+        self,
+        source: Any,
+        evaluate: Callable[[NDArray], pd.DataFrame],
+        triggers: Sequence[Trigger] = (),
+        *,
+        log: str | os.PathLike[str] | None = None,
+        log_particles: bool = True,
+        example: ArrayLike | None = None,
+        window: int = 1000,
+    ) -> None:
+        if not (callable(source) or callable(getattr(source, "grab", None)) or hasattr(source, "__iter__")):
+            raise TypeError(f"source: got {source!r}, allowed is one with a method grab, a function, or an iterable")
+        _function("evaluate", evaluate)
+        self._triggers = tuple(triggers)
+        names = [t.name if isinstance(t, Trigger) else t for t in self._triggers]
+        if not all(isinstance(t, Trigger) for t in self._triggers) or len(set(names)) < len(names):
+            raise TypeError(f"triggers: got {names}, allowed are Triggers of different names")
+        self._source, self._evaluate, self._log_particles = source, evaluate, log_particles
+        self._example = None if example is None else real_array("example", example, 2)
+        self._log_path, self._log = log, None
+        self._shape = None if self._example is None else self._example.shape
+        self._changed, self._stopping, self._finished = Condition(), Event(), Event()
+        self._slot: tuple[int, Frame] | None = None
+        self._lock = Lock()  # of all below
+        self._state, self._ended, self.started_s, self._last_s = "ready", False, np.nan, np.nan
+        self._grabbed = self._evaluated = self._failed = self._dropped = self._actions_failed = 0
+        self._error, self._latest = "", None
+        self._share, self._on, self._count = {}, dict.fromkeys(names, False), 0
+        window = whole("window", window, 2, 10**6)
+        self._arrived: deque[float] = deque(maxlen=window)
+        self._rows: deque[dict[str, Any]] = deque(maxlen=window)
+        self._threads = [Thread(target=run, name=run.__name__, daemon=True) for run in (self._grab, self._watch)]
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Evaluate the example, then begin to take frames.
+
+        Raises
+        ------
+        RuntimeError
+            If it was started before, or the example cannot be evaluated.
+        OSError
+            If the log cannot be opened.
+        """
+        if self._state != "ready":
+            raise RuntimeError(f"the monitor is {self._state}, and starts only once")
+        self._log = None if self._log_path is None else Logbook(self._log_path)
+        try:
+            if self._example is not None:
+                self._evaluate(self._example)
+        except Exception as error:
+            self._close()
+            raise RuntimeError(f"the example could not be evaluated: {as_text(error)}") from error
+        self._state, self.started_s = "running", perf_counter()
+        self._write({"event": "started", "utc": datetime.now(UTC).isoformat(), "t_s": self.started_s})
+        for thread in self._threads:
+            thread.start()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the source has ended and all is evaluated; False if that takes longer than `timeout_s`."""
+        return self._finished.wait(timeout_s)
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Finish the frame under evaluation, if that takes no longer than `timeout_s`, and close the log.
+
+        A source that waits for a frame is left behind waiting: it ends with the program. An action may call this,
+        too; then the log is closed where the `with` block ends, or by another call.
+        """
+        self._stopping.set()
+        with self._changed:
+            self._changed.notify_all()
+        if current_thread() is self._threads[1]:
+            return
+        if self._state == "running":
+            self._finished.wait(timeout_s)
+            self._threads[0].join(0.2)  # it is through, unless its source waits
+        self._close()
+
+    def _close(self) -> None:
+        with self._lock:
+            self._state = "stopped" if self._state in ("ready", "running") else self._state
+        if self._log is not None:
+            self._log.close()
+
+    # What can be asked at any time, from any thread.
+
+    @property
+    def latest(self) -> Result | None:
+        """Of the frame last looked at."""
+        return self._latest
+
+    def recent(self) -> pd.DataFrame:
+        """The last frames looked at: `frame`, `t_s` and `decision_s` since the start, `latency_ms`, `dropped`,
+        `count`, `error`, and `share_NAME`, `on_NAME` of each trigger."""
+        with self._lock:
+            return pd.DataFrame(list(self._rows))
+
+    def status(self) -> Status:
+        """How it is doing."""
+        with self._lock:
+            latency = np.array([row["latency_ms"] for row in self._rows] or [np.nan])
+            since = self._last_s if self._grabbed else self.started_s
+            log = self._log
+            return Status(
+                state=self._state,
+                grabbed=self._grabbed,
+                evaluated=self._evaluated,
+                failed=self._failed,
+                dropped=self._dropped,
+                camera_hz=_rate(list(self._arrived)),
+                rate_hz=_rate([row["decision_s"] for row in self._rows]),
+                latency_median_ms=float(np.median(latency)),
+                latency_p99_ms=float(np.percentile(latency, 99)),
+                latency_max_ms=float(latency.max()),
+                waiting_s=perf_counter() - since,
+                count=self._count,
+                share=dict(self._share),
+                on=dict(self._on),
+                actions_failed=self._actions_failed,
+                error=self._error,
+                log_written=log.written if log else 0,
+                log_waiting=log.waiting if log else 0,
+                log_lost=log.lost if log else 0,
+                log_problem=log.problem if log else "",
+            )
+
+    # The two threads.
+
+    def _grab(self) -> None:
+        """Put each frame of the source into the slot."""
+        try:
+            for item in _frames(self._source):
+                if self._stopping.is_set():
+                    break
+                frame = item if isinstance(item, Frame) else Frame(item, perf_counter())
+                try:
+                    frame = Frame(np.array(frame.image), frame.t_s)  # a camera may use its memory again
+                except ValueError:
+                    pass  # no array; it is refused where frames are evaluated
+                with self._lock:
+                    number, self._grabbed = self._grabbed, self._grabbed + 1
+                    self._last_s = perf_counter()
+                    self._arrived.append(frame.t_s)
+                with self._changed:
+                    missed, self._slot = self._slot, (number, frame)
+                    self._changed.notify()
+                if missed is not None:
+                    with self._lock:
+                        self._dropped += 1
+        except Exception as error:
+            with self._lock:
+                self._error = f"source: {as_text(error)}"
+            self._write({"event": "source failed", "error": as_text(error), "t_s": perf_counter()})
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify()
+
+    def _watch(self) -> None:
+        """Take what is in the slot, evaluate it, decide, act."""
+        last = -1
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._slot is not None or self._ended or self._stopping.is_set())
+                taken, self._slot = self._slot, None
+            if taken is None or self._stopping.is_set():
+                break
+            number, frame = taken
+            result = self._decided(number, frame, number - last - 1)
+            last = number
+            self._acted(result)
+        with self._lock:
+            self._dropped += taken is not None  # by a stop
+            self._state = "stopped" if self._stopping.is_set() else "ended"
+        self._write({"event": self._state, "grabbed": self._grabbed, "dropped": self._dropped, "t_s": perf_counter()})
+        self._finished.set()
+
+    def _decided(self, number: int, frame: Frame, dropped: int) -> Result:
+        try:
+            table = self._evaluate(self._checked(frame.image))
+            if not isinstance(table, pd.DataFrame):
+                raise TypeError(f"evaluate: got a {type(table).__name__} from it, allowed is a DataFrame")
+            if not table.columns.is_unique:
+                raise ValueError(f"evaluate: got columns {list(table)} from it, allowed are different names")
+            share = {t.name: float(t.share(table)) for t in self._triggers}
+            on = {t.name: t.after(self._on[t.name], share[t.name], len(table)) for t in self._triggers}
+            error = ""
+        except Exception as caught:
+            table, share, on, error = pd.DataFrame(), {}, self._on, as_text(caught)
+        return Result(
+            frame=number,
+            t_s=frame.t_s,
+            decision_s=perf_counter(),
+            dropped=dropped,
+            image=frame.image,
+            table=table,
+            share=share,
+            on=on,
+            changed=tuple(name for name, value in on.items() if value != self._on[name]),
+            error=error,
+        )
+
+    def _checked(self, image: Any) -> NDArray:
+        image = np.asarray(image)
+        if image.ndim != 2 or image.dtype.kind not in "buif":
+            raise ValueError(f"frame: got {image.dtype} of shape {image.shape}, allowed are numbers on two axes")
+        if self._shape is None:
+            self._shape = image.shape
+        if image.shape != self._shape:
+            raise ValueError(f"frame: got shape {image.shape}, allowed is {self._shape}, as before")
+        if image.dtype.kind == "f" and not np.isfinite(image).all():
+            raise ValueError("frame: got NaN or infinity, allowed are finite numbers")
+        return image
+
+    def _acted(self, result: Result) -> None:
+        failures = []
+        for trigger in self._triggers:
+            if trigger.name in result.changed:
+                call = trigger.action if result.on[trigger.name] else trigger.released
+                try:
+                    if call is not None:
+                        call(result)
+                except Exception as error:
+                    failures.append(f"{trigger.name}: {as_text(error)}")
+        done_s = perf_counter()
+        plain = {"frame": result.frame, "dropped": result.dropped, "count": len(result.table), "error": result.error}
+        row = {"t_s": result.t_s - self.started_s, "decision_s": result.decision_s - self.started_s}
+        by_name = {f"share_{n}": s for n, s in result.share.items()} | {f"on_{n}": o for n, o in result.on.items()}
+        with self._lock:
+            self._latest, self._on = result, result.on
+            if result.error:
+                self._failed += 1
+            else:
+                self._evaluated, self._count, self._share = self._evaluated + 1, len(result.table), result.share
+            self._actions_failed += len(failures)
+            self._error = (failures or [result.error or self._error])[-1]
+            self._rows.append(plain | row | {"latency_ms": result.latency_ms} | by_name)
+        if self._log is not None:
+            line = plain | {"t_s": result.t_s, "decision_s": result.decision_s, "done_s": done_s}
+            line |= {"action_error": "; ".join(failures), "share": result.share, "on": result.on}
+            if self._log_particles and len(result.table):
+                columns = result.table.select_dtypes(["number", "bool"])
+                line["particles"] = {name: columns[name].round(DIGITS).tolist() for name in columns}
+            self._write(line)
+
+    def _write(self, record: dict[str, Any]) -> None:
+        if self._log is not None:
+            self._log.append(record)
+
+
+def _frames(source: Any) -> Iterator[Any]:
+    take = getattr(source, "grab", source)
+    if not callable(take):
+        yield from source
+    else:
+        while (frame := take()) is not None:
+            yield frame
+
+
+def _rate(times_s: list[float]) -> float:
+    return (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 else np.nan

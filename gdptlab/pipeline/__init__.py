@@ -1,0 +1,16 @@
+"""From files to tables: reading images, finding beads, choosing settings, judging them, writing results."""
+
+import lazy_loader
+
+# Each module is imported when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "images": ["Images", "open_images", "open_scan"],
+        "beads": ["ScanReport", "find_beads"],
+        "quality": ["depth_quality", "report"],
+        "settings": ["Settings", "choose_settings"],
+        "stream": ["batch_to_parquet"],
+        "tables": ["in_um", "save_points", "save_table"],
+    },
+)

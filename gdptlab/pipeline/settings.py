@@ -1,0 +1,212 @@
+"""Settings of `locate` from the frames themselves, each of which can be given instead.
+
+The threshold of C_m: how often does what is certainly no particle reach it? In a frame with its sign turned every
+bright particle is dark, so whatever is found there is false: noise, gaps between particles, rings about them. It is
+as noisy and as crowded as the frame itself, so about as many of its finds lie above any C_m as of the frame's own
+that are false for the same reasons. What it does not show are finds on particles: part of a ring may look like a
+whole one from another depth. Such ghosts are counted on the calibration's own images, each alone on noise. The
+threshold is the lowest at which both kinds are few. (What it cannot see are particles that come out at a wrong depth.)
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from gdptlab._checks import choice, positive, real_array, whole
+from gdptlab.calibration import Calibration
+from gdptlab.denoising import noise_level
+from gdptlab.locate import METHODS, locate
+
+LOWEST = 0.2
+"""C_m from which on finds are counted."""
+
+DEPTHS = 25
+"""Images of the calibration, at most, on which ghosts are counted."""
+
+EVEN = 0.2
+"""Largest spread of brightness, its share, with which the joint fit is chosen: it takes particles to be alike."""
+
+EXPLAINED = 1.5
+"""Largest median chi2 of particles with which the joint fit is chosen."""
+
+LIKE = 0.5
+"""Smallest median C_m with which it is chosen: a crowd of unlike images, too, can explain anything."""
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """Settings for `locate` and `batch`, and how they were chosen. Made by `choose_settings`.
+
+    Attributes
+    ----------
+    arguments : dict
+        For use as `batch(frames, calibration, **settings.arguments)`.
+    table : DataFrame
+        A row for each setting (the index): `value`, `how` ("by itself" or "given") and `why`, in words.
+    threshold : float
+        The threshold of C_m, also where `arguments` has none as the joint fit needs none.
+    found, false : DataFrame
+        What correlation finds in the frames looked at, and in the same with their sign turned, from a C_m of `LOWEST`
+        on: the columns of `locate`, and `frame`.
+    ghosts : DataFrame
+        What it finds beside a lone particle at its own place, likewise; `frame` is the image of the calibration.
+    """
+
+    arguments: dict[str, object]
+    table: pd.DataFrame
+    threshold: float
+    found: pd.DataFrame
+    false: pd.DataFrame
+    ghosts: pd.DataFrame
+
+    @property
+    def inverted(self) -> bool:
+        """Whether frames with their sign turned fit the calibration better than the frames themselves."""
+        return _above(self.false["cm"], 0.5) > 2 * _above(self.found["cm"], 0.5)
+
+
+def choose_settings(
+    frames: Iterable[ArrayLike],
+    calibration: Calibration,
+    *,
+    threshold: float | None = None,
+    method: str | None = None,
+    refine: bool | None = None,
+    min_distance_px: float | None = None,
+    false_share: float = 0.01,
+    looked_at: int = 3,
+) -> Settings:
+    """Choose what `locate` is told, from some frames.
+
+    Parameters
+    ----------
+    frames : iterable of arrays (rows, columns)
+        Of the film to be measured; only some are looked at, from the first on.
+    calibration : Calibration
+    threshold : float, optional
+        Lowest C_m of a particle, used as it is. If not given, the lowest at which no more than `false_share` of the
+        finds are false, to judge by the frames with their sign turned and by the ghosts of lone particles.
+    method : str, optional
+        "correlation" or "joint". If not given, joint where its model holds: where it finds particles alike in
+        brightness (spread at most `EVEN`) and like the calibration's (median C_m at least `LIKE`) and explains what is
+        around them (median chi2 at most `EXPLAINED`).
+    refine : bool, optional
+        Of "correlation"; True if not given.
+    min_distance_px : float, optional
+        Of "correlation"; a quarter of a template if not given.
+    false_share : float
+        Share of false finds that is put up with.
+    looked_at : int
+        How many frames are looked at.
+
+    Returns
+    -------
+    Settings
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not of that form, or a frame is refused by `locate`; if a setting is given that the method
+        given does not have.
+    """
+    if positive("false_share", false_share) >= 1:
+        raise ValueError(f"false_share: got {false_share}, allowed is above 0 and below 1")
+    if threshold is not None and positive("threshold", threshold) > 1:
+        raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
+    if method is not None:
+        choice("method", method, METHODS)
+    given = {"threshold": threshold, "refine": refine, "min_distance_px": min_distance_px}
+    given = {name: value for name, value in given.items() if value is not None}
+    if method == "joint" and given:
+        raise ValueError(f"{', '.join(given)}: got one with method 'joint', which has none of them")
+    whole("looked_at", looked_at, 1, 10_000)
+    try:
+        looked = [real_array("image", frame, 2) for frame in islice(frames, looked_at)]
+    except TypeError as error:
+        if str(error).startswith("image"):
+            raise
+        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+    if not looked:
+        raise ValueError("frames: got none, needed is one or more")
+    others = {name: value for name, value in given.items() if name != "threshold"}
+    found, false = (
+        pd.concat(
+            [
+                locate(sign * frame, calibration, threshold=LOWEST, **others).assign(frame=i)
+                for i, frame in enumerate(looked)
+            ],
+            ignore_index=True,
+        )
+        for sign in (1, -1)
+    )
+    ghosts, alone = _ghosts(calibration, noise_level(looked[0]), others)
+    reasons = {"refine": "the whole stack is walked", "min_distance_px": "a quarter of a template"}
+    if threshold is None:
+        finds = (table["cm"] for table in (found, false, ghosts, alone))
+        threshold, reasons["threshold"] = _threshold(*finds, false_share)
+    if method is not None:
+        given["method"] = method
+    elif given:
+        method, reasons["method"] = "correlation", "only it has the settings given"
+    else:
+        method, reasons["method"] = _method(looked[0], calibration)
+    arguments = {"method": method}
+    if method == "correlation":
+        arguments |= {"threshold": threshold, "refine": True, "min_distance_px": calibration.size / 4} | given
+    rows = [
+        (name, value, *(("given", "") if name in given else ("by itself", reasons[name])))
+        for name, value in arguments.items()
+    ]
+    table = pd.DataFrame(rows, columns=["setting", "value", "how", "why"]).set_index("setting")
+    return Settings(arguments, table, threshold, found, false, ghosts)
+
+
+def _above(cm: pd.Series, threshold: float) -> int:
+    return int((cm >= threshold).sum())
+
+
+def _ghosts(calibration: Calibration, noise: float, settings: dict[str, object]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """What is found beside, and at, the place of lone particles."""
+    size, rng = calibration.size, np.random.default_rng(0)
+    middle, beside, at = size - 1, [], []
+    for k in np.unique(np.rint(np.linspace(0, len(calibration) - 1, DEPTHS)).astype(int)):
+        frame = rng.normal(0, max(noise, 1e-9), (2 * size - 1, 2 * size - 1))
+        near = slice(middle - size // 2, middle + size // 2 + 1)
+        frame[near, near] += calibration.images[k]
+        finds = locate(frame, calibration, threshold=LOWEST, **settings).assign(frame=k)
+        own = np.hypot(finds["x_px"] - middle, finds["y_px"] - middle) < size / 4
+        at.append(finds[own])
+        beside.append(finds[~own])
+    return pd.concat(beside, ignore_index=True), pd.concat(at, ignore_index=True)
+
+
+def _threshold(
+    found: pd.Series, false: pd.Series, ghosts: pd.Series, alone: pd.Series, share: float
+) -> tuple[float, str]:
+    """Lowest threshold with so small a share of false finds, and the reason in words."""
+    for threshold in np.arange(LOWEST, 0.99, 0.01).round(2).tolist():
+        n, n_false, n_ghosts, n_alone = (_above(cm, threshold) for cm in (found, false, ghosts, alone))
+        if n and n_false / n + n_ghosts / max(n_ghosts + n_alone, 1) <= share:
+            turned = f"{n} found from there on, {n_false} with the frames' sign turned"
+            return threshold, f"{turned}; {n_ghosts} beside {n_alone} lone particles"
+    return 0.5, "nothing is found that is not found with the frames' sign turned, too"
+
+
+def _method(frame: NDArray, calibration: Calibration) -> tuple[str, str]:
+    """What method a frame is for, and the reason in words."""
+    table = locate(frame, calibration, method="joint")
+    if len(table) < 5:
+        return "correlation", "too few particles to see if they are alike, as joint takes them to be"
+    brightness, chi2 = table["brightness"], float(table["chi2"].median())
+    # Of normal numbers, the standard deviation; of a few far brighter ones it takes notice.
+    spread = float((brightness.quantile(0.9) - brightness.quantile(0.1)) / (2.563 * brightness.median()))
+    cm = float(table["cm"].median())
+    method = "joint" if spread <= EVEN and chi2 <= EXPLAINED and cm >= LIKE else "correlation"
+    return method, (
+        f"joint finds {len(table)} particles, as bright as each other to {100 * spread:.0f} %, with a median C_m of "
+        f"{cm:.2f}, and leaves a chi2 of {chi2:.1f}"
+    )

@@ -1,0 +1,185 @@
+"""A calibration made from a scan by itself: which beads, how large, and what is said of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial import KDTree
+
+from gdptlab import Calibration, assessment, find_beads, locate
+from gdptlab.experiment import Camera, Microscope
+from gdptlab.pipeline.quality import depth_quality, report
+
+Z_UM = np.linspace(-50, 50, 26)
+PLACES = np.array([[60.3, 55.8], [180.2, 60.4], [300.7, 52.1], [58.0, 170.9], [182.6, 176.3], [205.0, 190.0]])
+SHAPE = (230, 360)
+SIGN = {"fluorescent": 1, "brightfield": -1, "disturbed": -1}  # of the beads' light against the background
+
+
+def scan_of(places, *, kind="fluorescent", seed=0):
+    """Scan of beads at places (n, 2) that lie in one plane."""
+    beads = pd.DataFrame({"x_px": places[:, 0], "y_px": places[:, 1]})
+    microscope, rng = Microscope(), np.random.default_rng(seed)
+    return np.stack([microscope.render(beads.assign(z_um=z), SHAPE, image_type=kind, rng=rng) for z in Z_UM])
+
+
+@pytest.fixture(scope="module")
+def scan():
+    return scan_of(PLACES)
+
+
+@pytest.fixture(scope="module")
+def made(scan):
+    return Calibration.from_scan(scan, Z_UM)
+
+
+@pytest.mark.parametrize("kind", SIGN)
+def test_beads_are_found(kind) -> None:
+    beads = find_beads(scan_of(PLACES, kind=kind, seed=3), Z_UM)
+    distance, which = KDTree(beads[["x_px", "y_px"]]).query(PLACES)
+    assert len(beads) == len(PLACES) and distance.max() < 2
+    assert (np.sign(beads["brightness"]) == SIGN[kind]).all()
+    pair = np.hypot(*(PLACES[4] - PLACES[5]))
+    np.testing.assert_allclose(beads["room_px"].iloc[which[4:]], pair, atol=2)
+
+
+def test_only_beads_alone_are_used(made) -> None:
+    used = made.report.beads[made.report.beads["verdict"] == "used"]
+    assert len(used) == 4
+    assert KDTree(PLACES[:4]).query(used[["x_px", "y_px"]])[0].max() < 1
+    assert made.size >= 55 and made.report.settings.loc["size", "how"] == "by itself"
+
+
+def test_average_has_less_noise_than_a_bead(scan, made) -> None:
+    one = Calibration.from_bead(scan, Z_UM, *PLACES[0], size=made.size)
+    assert made.own_error[:, 2].mean() < 0.75 * one.own_error[:, 2].mean()
+
+
+def test_what_is_given_is_used(scan) -> None:
+    made = Calibration.from_scan(scan, Z_UM, beads_px=PLACES[:2], size=41, n_sub=7)
+    assert made.size == 41 and len(made.subset) == 7
+    assert list(made.report.settings["how"]) == ["given"] * 3
+    assert list(made.report.beads["verdict"]) == ["used"] * 2
+
+
+def test_order_of_the_scan_does_not_matter(scan, made) -> None:
+    turned = Calibration.from_scan(scan[::-1], Z_UM[::-1])
+    np.testing.assert_allclose(turned.stack, made.stack)
+    np.testing.assert_allclose(turned.report.drift_px, made.report.drift_px)
+
+
+def test_beads_at_other_heights_are_moved_in_z() -> None:
+    places, microscope, rng = PLACES[:3], Microscope(), np.random.default_rng(4)
+    higher = np.array([0.0, 0.0, 3.0])
+    beads = pd.DataFrame({"x_px": places[:, 0], "y_px": places[:, 1]})
+    scan = [microscope.render(beads.assign(z_um=0.9 * z - higher), SHAPE, rng=rng) for z in Z_UM]
+    table = Calibration.from_scan(np.stack(scan), Z_UM).beads.sort_values("x_px")
+    np.testing.assert_allclose(table["offset_um"], higher / 0.9, atol=0.5)
+
+
+def test_drift_is_seen(scan) -> None:
+    wander = np.rint(np.linspace(-4, 4, len(scan))).astype(int)
+    moved = np.stack([np.roll(image, by, axis=1) for image, by in zip(scan, wander, strict=True)])
+    made = Calibration.from_scan(moved, Z_UM)
+    np.testing.assert_allclose(made.report.drift_px[:, 0], wander, atol=0.7)
+    assert report(made).loc["drift", "verdict"] == "look"
+
+
+def test_clipped_beads_are_left_out_if_others_are_not(microscope) -> None:
+    beads = pd.DataFrame({"x_px": PLACES[:4, 0], "y_px": PLACES[:4, 1], "brightness": [1, 1, 4, 1]})
+    camera, rng = Camera(bit_depth=13), np.random.default_rng(5)
+    scan = np.stack([microscope.render(beads.assign(z_um=z), SHAPE, camera=camera, rng=rng) for z in Z_UM])
+    made = Calibration.from_scan(scan, Z_UM)
+    assert made.report.beads["verdict"].value_counts().to_dict() == {"used": 3, "clipped": 1}
+    assert 0 < made.report.clipped.max() <= 0.25
+    all_of_them = Calibration.from_scan(np.minimum(scan, 1200), Z_UM)
+    assert report(all_of_them).loc["clipping", "verdict"] == "bad"
+
+
+def test_twins_are_seen_where_defocus_is_symmetric(made) -> None:
+    y, x = np.indices((31, 31)) - 15
+    width = np.hypot(2, Z_UM / 10)[:, None, None]
+    stack = 1000 * np.exp(-(x**2 + y**2) / (2 * width**2)) / width**2
+    flat = Calibration.from_stack(stack + np.random.default_rng(7).normal(0, 0.5, stack.shape), Z_UM)
+    twins = depth_quality(flat).query("twin > 0.95")
+    assert len(twins) > 15
+    np.testing.assert_allclose(twins["twin_um"], -twins["z_um"], atol=9)
+    assert not (depth_quality(made)["twin"] > 0.95).any()
+
+
+def test_report_of_a_good_calibration(made) -> None:
+    table = report(made)
+    assert list(table) == ["verdict", "finding", "advice"] and (table["verdict"] != "bad").all()
+    assert (table.loc[table["verdict"] == "good", "advice"] == "").all()
+
+
+def test_better_light_is_less_error(made) -> None:
+    dark, bright = (depth_quality(made, noise) for noise in (40, 10))
+    np.testing.assert_allclose(dark["z_std_um"], 4 * bright["z_std_um"])
+    np.testing.assert_allclose(bright["signal_to_noise"], 4 * dark["signal_to_noise"])
+    with pytest.raises(ValueError, match="noise: got 0, allowed"):
+        depth_quality(made, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"scan": np.ones((26, 40, 40))}, ValueError, "scan: got frames that are all alike"),
+        ({"scan": np.ones((26, 40))}, ValueError, r"scan: got shape \(1, 40\), allowed are 3 axes"),
+        ({"scan": np.full((26, 40, 40), np.nan)}, ValueError, "scan: got NaN"),
+        ({"z_um": Z_UM[:-1]}, ValueError, "scan, z_um: got 26 frames and 25 depths"),
+        ({"size": 40}, ValueError, "size: got 40 px, allowed are odd sizes"),
+        ({"size": 201}, ValueError, "scan: got 6 beads, none with 201 px to the next and 102 to the border"),
+        ({"n_sub": 1}, ValueError, "n_sub: got 1, allowed"),
+        ({"size": 4.5}, TypeError, "size: got 4.5, allowed"),
+        ({"beads_px": [[1, 2, 3]]}, ValueError, r"beads_px: got shape \(1, 3\)"),
+        ({"beads_px": [[-5, 20]]}, ValueError, "beads_px: got .*, allowed are places in the frames"),
+    ],
+)
+def test_refuses(scan, changes, error, message) -> None:
+    with pytest.raises(error, match=message):
+        Calibration.from_scan(**{"scan": scan, "z_um": Z_UM} | changes)
+
+
+def test_noise_alone_holds_no_beads() -> None:
+    noise = np.random.default_rng(6).normal(100, 5, (20, 60, 60))
+    with pytest.raises(ValueError, match="in which nothing stands out of the noise"):
+        find_beads(noise, np.arange(20.0))
+
+
+def test_a_frame_of_the_scan_is_measured_where_it_was_taken(scan, made) -> None:
+    table = locate(scan[7], made, threshold=0.5)
+    true = pd.DataFrame({"x_px": PLACES[:4, 0], "y_px": PLACES[:4, 1], "z_um": Z_UM[7]})
+    assert assessment.scores(table, true).sigma_z_um < 1 and assessment.scores(table, true).recall == 1
+
+
+def lobed_scan(places, z_um):
+    """Beads that are two spots, 18 px apart, wherever they are in focus, and one blur elsewhere."""
+    y, x = np.indices((240, 320))
+    scan = []
+    for z in z_um:
+        width = 2 + abs(z) / 5
+        spots = [np.exp(-((x - a) ** 2 + (y - b - s) ** 2) / (2 * width**2)) for a, b in places for s in (-9, 9)]
+        scan.append(2000 / width**2 * np.sum(spots, axis=0))
+    return np.array(scan) + np.random.default_rng(4).normal(0, 4, (len(z_um), *y.shape))
+
+
+def test_spots_of_one_bead_are_one_bead() -> None:
+    z_um, places = np.linspace(-30, 30, 21), np.array([[50, 60], [160, 55], [270, 70], [60, 180], [200, 185.0]])
+    found = find_beads(lobed_scan(places, z_um), z_um)
+    assert len(found) == 5
+    assert KDTree(found[["x_px", "y_px"]]).query(places)[0].max() < 1
+    assert found["brightness"].between(0.5, 1.1 * found["brightness"].max()).all() and found["brightness"].min() > 200
+
+
+def test_beads_in_a_regular_array_stay_apart() -> None:
+    grid = np.stack(np.meshgrid(np.arange(30, 330, 50), np.arange(30, 220, 50)), axis=-1).reshape(-1, 2)
+    assert len(find_beads(scan_of(grid), Z_UM)) == len(grid)
+
+
+def test_leaps_of_a_bead_are_told_from_drift(made) -> None:
+    steady = report(made).loc["drift"]
+    leap = replace(made, drift_px=np.where(np.arange(26)[:, None] < 13, 0.0, [9.0, 0.0]))
+    assert steady["verdict"] == "good"
+    assert report(leap).loc["drift", "verdict"] == "bad" and "beads_px" in report(leap).loc["drift", "advice"]

@@ -1,0 +1,84 @@
+"""Checks of arguments: the message names the argument, what came and what is allowed."""
+
+import numpy as np
+import pytest
+
+from gdptlab import _checks as check
+
+
+def test_number():
+    assert check.number("at", np.float32(-2)) == -2
+    for value, error in ((np.nan, ValueError), (-np.inf, ValueError), ("1", TypeError), (True, TypeError)):
+        with pytest.raises(error, match=f"^at: got {value!r}, allowed is a finite number$"):
+            check.number("at", value)
+
+
+@pytest.mark.parametrize("value", [1, 0.5, np.float32(2), np.int64(3)])
+def test_positive_returns_a_float(value):
+    assert check.positive("gap", value) == value
+    assert type(check.positive("gap", value)) is float
+    assert check.positive("gap", 0, zero=True) == 0
+
+
+@pytest.mark.parametrize("value", [0, -1, np.nan, np.inf])
+def test_positive_refuses_values(value):
+    with pytest.raises(ValueError, match=rf"^gap: got {value}, allowed is a finite number above 0$"):
+        check.positive("gap", value)
+
+
+@pytest.mark.parametrize("value", ["1", None, True, 1j, [1]])
+def test_positive_refuses_types(value):
+    with pytest.raises(TypeError, match=r"^gap: got .*, allowed is a finite number, at least 0$"):
+        check.positive("gap", value, zero=True)
+
+
+@pytest.mark.parametrize("value", [2, 5, np.uint8(3)])
+def test_whole_returns_an_int(value):
+    assert check.whole("n", value, 2, 5) == value
+    assert type(check.whole("n", value, 2, 5)) is int
+
+
+@pytest.mark.parametrize(
+    ("value", "error"), [(1, ValueError), (6, ValueError), (3.0, TypeError), ("3", TypeError), (True, TypeError)]
+)
+def test_whole_refuses(value, error):
+    with pytest.raises(error, match=r"^n: got .*, allowed are whole numbers from 2 to 5$"):
+        check.whole("n", value, 2, 5)
+
+
+def test_choice():
+    assert check.choice("axis", "y", "xy") == "y"
+    for value in ("z", None, 3):
+        with pytest.raises(ValueError, match=f"^axis: got {value!r}, allowed are 'x', 'y'$"):
+            check.choice("axis", value, "xy")
+
+
+@pytest.mark.parametrize("dtype", [bool, np.uint8, np.int64, np.float16, np.float64, ">u2"])
+def test_real_array_gives_float32_of_any_real_type(dtype):
+    given = np.array([[0, 1, 1], [1, 0, 1]], dtype=dtype)
+    array = check.real_array("image", given, 2)
+    assert array.dtype == np.float32 and array.flags.c_contiguous
+    np.testing.assert_array_equal(array, given)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "message"),
+    [
+        ([1, 2], ValueError, r"got shape \(2,\), allowed are 2 axes, none of them empty"),
+        (np.zeros((0, 3)), ValueError, r"got shape \(0, 3\)"),
+        (
+            np.zeros((4, 5, 3)),
+            ValueError,
+            r"got shape .*; for a colour image take one channel, as in image",
+        ),
+        ([[1j]], TypeError, "got values of type complex128, allowed are real numbers"),
+        ([["a"]], TypeError, "got values of type <U1"),
+        ([[None]], TypeError, "got values of type object"),
+        ([[np.nan]], ValueError, "got NaN or infinity, allowed are finite numbers"),
+        ([[-np.inf]], ValueError, "got NaN or infinity"),
+        ([[1e39]], ValueError, "fit into float32"),
+    ],
+)
+def test_real_array_refuses(value, error, message):
+    with pytest.raises(error, match=f"^image: .*{message}"):
+        check.real_array("image", value, 2)

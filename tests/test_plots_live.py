@@ -1,0 +1,118 @@
+"""Pictures of a monitor show what it saw."""
+
+import sys
+import time
+import types
+from dataclasses import replace
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+
+from gdptlab import plots
+from gdptlab.experiment.channel import Channel
+from gdptlab.live.monitor import Monitor, Trigger, middle_thirds
+
+CHANNEL = Channel(width_um=120, height_um=60)
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_open():
+    yield
+    assert plt.get_fignums() == []
+
+
+def to_channel(table):
+    return table.assign(y_um=table["y_px"] - 30)
+
+
+def seen(image):
+    n = int(image[0, 0])
+    y_px = np.where(np.arange(10) < n, 31.0, 80.0)
+    return pd.DataFrame({"x_px": np.arange(10.0), "y_px": y_px, "z_um": 3.0})
+
+
+@pytest.fixture
+def monitor():
+    thirds = middle_thirds(CHANNEL, to_channel).values()
+    triggers = [Trigger(name=third.of, share=third, action=str) for third in thirds]
+    frames = iter([np.full((90, 40), n, np.uint8) for n in (4, 9)])
+    monitor = Monitor(lambda: slowly(monitor, frames), seen, triggers)
+    with monitor:
+        assert monitor.wait(60)
+    return monitor
+
+
+def slowly(monitor, frames):
+    """The next frame when the one before has been seen."""
+    while (status := monitor.status()).grabbed > status.evaluated:
+        time.sleep(0.001)
+    return next(frames, None)
+
+
+def panel_of(monitor, **changed):
+    status = replace(monitor.status(), **changed)
+    settings = {"channel": CHANNEL, "to_channel": to_channel, "level": 0.85}
+    return plots.live_panel(monitor.latest, monitor.recent(), status, **settings)
+
+
+def test_the_panel_shows_the_last_frame_and_the_past(monitor):
+    figure = panel_of(monitor)
+    frame, section, words, shares, late = figure.axes
+    assert frame.get_title(loc="left") == "frame 1: 10 particles"
+    np.testing.assert_array_equal(frame.images[0].get_array(), np.full((90, 40), 9))
+    np.testing.assert_array_equal(frame.collections[0].get_offsets()[:, 0], np.arange(10))
+    np.testing.assert_array_equal(section.collections[0].get_offsets()[[0, 9]], [[1, 3], [50, 3]])
+    lines = {line.get_label(): line.get_ydata() for line in shares.get_lines()}
+    np.testing.assert_allclose(lines["h/3"], [1, 1])
+    np.testing.assert_allclose(lines["w/3"], [0.4, 0.9])
+    np.testing.assert_array_equal(late.get_lines()[0].get_ydata(), monitor.recent()["latency_ms"])
+    assert words.texts[0].get_text().startswith("ended, 2 frames\n")
+
+
+def test_the_panel_says_what_is_wrong(monitor):
+    text = (
+        panel_of(monitor, state="running", waiting_s=7.2, error="ValueError: no", log_problem="full").axes[2].texts[0]
+    )
+    assert "no frame for 7 s" in text.get_text() and "ValueError: no" in text.get_text()
+    assert "lines !" in text.get_text()
+
+
+def test_the_panel_of_a_monitor_that_has_seen_nothing():
+    monitor = Monitor([], seen)
+    settings = {"channel": CHANNEL, "to_channel": to_channel}
+    figure = plots.live_panel(monitor.latest, monitor.recent(), monitor.status(), **settings)
+    assert len(figure.axes[0].images) == 0
+
+
+def test_it_is_drawn_until_the_source_ends(monitor, monkeypatch):
+    shown = []
+    handle = types.SimpleNamespace(update=shown.append)
+    display = types.SimpleNamespace(display=lambda figure, display_id: shown.append(figure) or handle)
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    waits = iter([False, False, True])
+    monkeypatch.setattr(monitor, "wait", lambda seconds: next(waits))
+    plots.watch_live(monitor, period_s=0.1, channel=CHANNEL, to_channel=to_channel)
+    assert len(shown) == 3
+
+
+def test_latencies_fall_from_left_to_right():
+    runs = {"a": pd.DataFrame({"t_s": [0.0, 0.1, 0.2, 0.3], "latency_ms": [5.0, 9.0, 7.0, 6.0]})}
+    line, tail = plots.latencies(runs, {"allowed": 8}).axes
+    np.testing.assert_array_equal(line.get_lines()[0].get_ydata(), [5, 9, 7, 6])
+    np.testing.assert_array_equal(tail.get_lines()[0].get_xydata(), [[0.25, 9], [0.5, 7], [0.75, 6], [1, 5]])
+
+
+def test_one_loop_and_many():
+    true = pd.DataFrame({"t_s": [0.0, 1.0], "fraction_w": [0.3, 0.95]})
+    recent = pd.DataFrame({"t_s": [0.1, 0.9], "share": [0.3, 0.9]})
+    (axes,) = plots.one_loop(recent, true, 0.95, 0.9).axes
+    assert axes.texts[0].get_text() == "sound off at 0.95 s"
+    loop = pd.DataFrame({"energy_density_J_m3": [4.0, 6.0], "needed_s": [1.2, 0.9], "off_s": [1.3, 1.0]})
+    loop["true_share"] = [0.95, 0.89]
+    timers = pd.DataFrame({"seed": [1, 2, 1, 2], "off_s": [0.5, 0.5, 1.5, 1.5], "true_share": [0.5, 0.95, 0.93, 0.99]})
+    left, right = plots.loop_and_timer(loop, timers, 0.9, {"nominal": 1.1}).axes
+    np.testing.assert_array_equal(left.get_lines()[1].get_xydata(), [[4, 1.3], [6, 1]])
+    np.testing.assert_array_equal(right.get_lines()[0].get_xydata(), [[0.5, 50], [1.5, 0]])
+    assert right.get_lines()[1].get_ydata()[0] == 50
