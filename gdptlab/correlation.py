@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from gdptlab._compiled import compiled, inlined
 
 FLAT = 1e-4
-"""A window whose contrast is below this share of the image's is taken as flat: its correlation is 0."""
+"""A window whose contrast is below this fraction of the image's is taken as flat: its correlation is 0."""
 
 BETWEEN = 0.95
-"""Share of its C_m that a peak between pixels still has at the nearest one, about, at least."""
+"""Fraction of its C_m that a peak between pixels still has at the nearest one, about, at least."""
 
 APART_PX = 2
 """No pixel so near to a peak is higher."""

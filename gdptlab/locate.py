@@ -81,7 +81,7 @@ def locate(
         `at_end`, whether that is the stack's first or last image, so that z may lie beyond it. With
         "joint" `z_um` is less `Calibration.own_bias_um`, and there are also `x_std_px`, `y_std_px` and `z_std_um`,
         standard deviations (noise of the frame and of the calibration, neighbours considered; wider for a
-        particle unlike the others in brightness); `brightness`, 1 for that of the calibration's particle; and
+        particle unlike the others in amplitude); `amplitude`, 1 for that of the calibration's particle; and
         `chi2`, the mean square of what is left around the particle, in units of the noise: well above 1 for
         what is no particle of this kind.
 

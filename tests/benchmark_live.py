@@ -48,7 +48,7 @@ def peak_mb() -> float:
 def watched(device: Device, film: Film, evaluate: object) -> tuple[Status, float]:
     """Status of a monitor after the film, and MB by which the peak of memory rose."""
     channel = film.trajectories.focusing.channel
-    triggers = [Trigger(name=of, share=s, action=str) for of, s in middle_thirds(channel, film.to_channel).items()]
+    triggers = [Trigger(name=of, fraction=s, action=str) for of, s in middle_thirds(channel, film.to_channel).items()]
     example, before = film[0], peak_mb()
     device.run(film, ahead=min(AHEAD, len(film)))
     with Monitor(device, evaluate, triggers, example=example) as monitor:

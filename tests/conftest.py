@@ -1,4 +1,4 @@
-"""Microscope, calibrations and frames that many tests share; each is made once."""
+"""Microscope, calibrations and frames that many tests fraction; each is made once."""
 
 import os
 

@@ -134,7 +134,7 @@ def test_scores_by_z_by_hand():
     np.testing.assert_allclose(found["sigma_x_px"], [0, 0.5])
 
 
-def test_precision_by_z_is_a_share():
+def test_precision_by_z_is_a_fraction():
     """A particle that is measured in the next bin does not push a precision above 1."""
     true = table([10, 30], [10, 30], [-1, -20])
     found = scores_by_z(table([10, 30], [10, 30], [1, -20]), true, [-50, 0, 50])
@@ -215,9 +215,9 @@ def test_assessment_intervals_hold_the_truth():
         locator, true = imitation(rng, 10, count=8)
         found = standard_assessment(locator, range(10), true, rng=seed).iloc[0]
         held.append([found[f"{n}_low"] <= v <= found[f"{n}_high"] for n, v in (("recall", 0.8), ("sigma_z_um", 0.5))])
-    share = np.mean(held, axis=0)
-    print(f"95 % intervals hold recall and sigma_z in {share} of 60")
-    assert ((share > 0.8) & (share <= 1)).all()
+    fraction = np.mean(held, axis=0)
+    print(f"95 % intervals hold recall and sigma_z in {fraction} of 60")
+    assert ((fraction > 0.8) & (fraction <= 1)).all()
 
 
 def test_assessment_of_nothing_found():

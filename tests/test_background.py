@@ -9,7 +9,7 @@ from gdptlab.fit.renderer import ParticleImages
 
 SHAPE, KNOT_PX, NOISE = (200, 260), 60.0, 10.0
 COEFFICIENTS = 6 * 7  # round(side / knot) + 3 in each direction
-# Products of every third row are off by a share of what they could be at most (Cauchy and Schwarz). They only steer
+# Products of every third row are off by a fraction of what they could be at most (Cauchy and Schwarz). They only steer
 # the fit; the worst are those of the derivative by y, of sharp images of which the frame's edge leaves few rows.
 PRODUCTS_MEDIAN, PRODUCTS_95, PRODUCTS_WORST = 0.002, 0.04, 0.5
 
@@ -43,7 +43,7 @@ def basis(surface, count=COEFFICIENTS):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_recovered_under_noise(surface, seed):
-    """Each coefficient takes its share of the noise, and no more; the shape itself fits to a tenth of it."""
+    """Each coefficient takes its fraction of the noise, and no more; the shape itself fits to a tenth of it."""
     off = surface.fit(noisy(seed), uniform()) - smooth()
     assert np.sqrt((off**2).mean()) < 1.5 * NOISE * np.sqrt(COEFFICIENTS / off.size) + 0.1 * NOISE
     assert np.abs(off).max() < NOISE

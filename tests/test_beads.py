@@ -39,7 +39,7 @@ def test_beads_are_found(kind) -> None:
     beads = find_beads(scan_of(PLACES, kind=kind, seed=3), Z_UM)
     distance, which = KDTree(beads[["x_px", "y_px"]]).query(PLACES)
     assert len(beads) == len(PLACES) and distance.max() < 2
-    assert (np.sign(beads["brightness"]) == SIGN[kind]).all()
+    assert (np.sign(beads["amplitude"]) == SIGN[kind]).all()
     pair = np.hypot(*(PLACES[4] - PLACES[5]))
     np.testing.assert_allclose(beads["room_px"].iloc[which[4:]], pair, atol=2)
 
@@ -87,7 +87,7 @@ def test_drift_is_seen(scan) -> None:
 
 
 def test_clipped_beads_are_left_out_if_others_are_not(microscope) -> None:
-    beads = pd.DataFrame({"x_px": PLACES[:4, 0], "y_px": PLACES[:4, 1], "brightness": [1, 1, 4, 1]})
+    beads = pd.DataFrame({"x_px": PLACES[:4, 0], "y_px": PLACES[:4, 1], "amplitude": [1, 1, 4, 1]})
     camera, rng = Camera(bit_depth=13), np.random.default_rng(5)
     scan = np.stack([microscope.render(beads.assign(z_um=z), SHAPE, camera=camera, rng=rng) for z in Z_UM])
     made = Calibration.from_scan(scan, Z_UM)
@@ -170,7 +170,7 @@ def test_spots_of_one_bead_are_one_bead() -> None:
     found = find_beads(lobed_scan(places, z_um), z_um)
     assert len(found) == 5
     assert KDTree(found[["x_px", "y_px"]]).query(places)[0].max() < 1
-    assert found["brightness"].between(0.5, 1.1 * found["brightness"].max()).all() and found["brightness"].min() > 200
+    assert found["amplitude"].between(0.5, 1.1 * found["amplitude"].max()).all() and found["amplitude"].min() > 200
 
 
 def test_beads_in_a_regular_array_stay_apart() -> None:

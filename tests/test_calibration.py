@@ -376,11 +376,11 @@ def test_no_file(tmp_path):
         Calibration.load(tmp_path / "absent.npz")
 
 
-@pytest.mark.parametrize("share", [0.01, 0.5, 0.95, 0.999])
-def test_truncated_files_are_refused(calibration, tmp_path, share):
+@pytest.mark.parametrize("fraction", [0.01, 0.5, 0.95, 0.999])
+def test_truncated_files_are_refused(calibration, tmp_path, fraction):
     path = tmp_path / "a.npz"
     calibration.save(path)
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    path.write_bytes(path.read_bytes()[: int(fraction * path.stat().st_size)])
     with pytest.raises(ValueError, match=r"^path: got 'a.npz', which cannot be read as a calibration"):
         Calibration.load(path)
 

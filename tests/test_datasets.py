@@ -11,7 +11,7 @@ from gdptlab.pipeline.images import open_images
 
 # Found and RMSE of z in µm of published methods on the planar beads, by the score of `score`.
 PUBLISHED = {"gdpt": (0.36, 1.66, -0.63), "defocustracker": (0.50, 1.78, -0.47), "idpt": (0.95, 0.67, 0.05)}
-# Of ours, with one calibration bead: share found, at least, and RMSE of z in µm, at most.
+# Of ours, with one calibration bead: fraction found, at least, and RMSE of z in µm, at most.
 FOUND, RMSE_UM = 0.45, 1.6
 
 
@@ -83,7 +83,7 @@ def beads():
 
 
 def score(measured: pd.DataFrame, true: pd.DataFrame) -> tuple[float, float, float]:
-    """Share of beads whose nearest measurement within 3 px is within 5 µm in z, RMSE and mean error of those."""
+    """Fraction of beads whose nearest measurement within 3 px is within 5 µm in z, RMSE and mean error of those."""
     errors = []
     for frame, part in true.groupby("frame"):
         found = measured[measured["frame"] == frame]

@@ -9,7 +9,7 @@ import pytest
 from gdptlab.experiment import fractions, trigger_time
 from gdptlab.experiment.channel import Acoustics, Focusing, Trajectories
 from gdptlab.experiment.film import Film
-from gdptlab.live.device import SLOTS, Device, Switched, closed_loop, switched, timed, true_shares
+from gdptlab.live.device import SLOTS, Device, Switched, closed_loop, switched, timed, true_fractions
 
 FAST = Focusing(acoustics=Acoustics(energy_density_J_m3=30.0))  # all is over after half a second
 SHAPE = (320, 180)
@@ -174,12 +174,12 @@ def test_a_device_that_is_gone():
 # -------------------- loop and timer
 
 
-def test_true_shares_are_those_of_the_film():
+def test_true_fractions_are_those_of_the_film():
     made = film(9)
     expected = fractions(made.to_channel(made.truth()), np.arange(len(made)), FAST.channel)
-    shares = true_shares(made, made.times_s)
+    found = true_fractions(made, made.times_s)
     for name in ("count", "fraction_h", "fraction_w"):
-        np.testing.assert_array_equal(shares[name], expected[name])
+        np.testing.assert_array_equal(found[name], expected[name])
 
 
 class Slow:
@@ -201,10 +201,10 @@ def test_the_monitor_switches_the_sound_off(device, tmp_path):
     assert 0 < row["exposed_s"] <= row["delivered_s"] < row["off_s"] < 3
     assert row["delay_ms"] == pytest.approx(1e3 * (row["off_s"] - row["delivered_s"]))
     assert row["exposure_delay_ms"] >= row["delay_ms"] > 0
-    assert row["share"] == 1
-    assert row["true_share"] == true_shares(device.film, [row["off_s"]])["fraction_w"].item()
+    assert row["fraction"] == 1
+    assert row["true_fraction"] == true_fractions(device.film, [row["off_s"]])["fraction_w"].item()
     times = np.arange(0, 3, 0.01)
-    assert row["needed_s"] == trigger_time(times, true_shares(made, times)["fraction_w"])
+    assert row["needed_s"] == trigger_time(times, true_fractions(made, times)["fraction_w"])
     assert device.off_s == row["off_s"] and device.grab() is None
     assert (tmp_path / "log").exists()
 
@@ -220,8 +220,8 @@ def test_a_timer_knows_nothing_of_the_particles():
     assert table["seed"].tolist() == [12, 12, 13, 13] and table["off_s"].tolist() == [0.01, 0.5] * 2
     for made, part in zip(films, (table[:2], table[2:]), strict=True):
         here = made.trajectories.positions(0.5)
-        assert part["true_share"].iloc[1] == (here["z_um"].abs() <= 100 / 6).mean()
-        assert part["true_share"].iloc[0] < part["true_share"].iloc[1]
+        assert part["true_fraction"].iloc[1] == (here["z_um"].abs() <= 100 / 6).mean()
+        assert part["true_fraction"].iloc[0] < part["true_fraction"].iloc[1]
     with pytest.raises(ValueError, match="of: got"):
         timed(films, [0.1], of="x")
     assert isinstance(films[0].trajectories, Trajectories)

@@ -29,7 +29,7 @@ def test_error_leaves_the_old_file_and_nothing_else(tmp_path: Path, error: type[
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_two_writers_do_not_share_a_temporary_file(tmp_path: Path) -> None:
+def test_two_writers_do_not_fraction_a_temporary_file(tmp_path: Path) -> None:
     path = tmp_path / "cache.npz"
     with written_whole(path) as first, written_whole(str(path)) as second:
         first.write_text("first")

@@ -239,12 +239,12 @@ def test_not_a_tiff(tmp_path, content):
 
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.7, 0.99])
-def test_truncated_tiff(tmp_path, compression, share):
+@pytest.mark.parametrize("fraction", [0.05, 0.3, 0.7, 0.99])
+def test_truncated_tiff(tmp_path, compression, fraction):
     path = tmp_path / "a.tif"
     images = np.random.default_rng(1).integers(0, 4000, (6, 40, 50), np.uint16)
     whole = write(path, images, compression=compression).read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
+    path.write_bytes(whole[: int(fraction * len(whole))])
     with pytest.raises(ValueError, match=r"^path: got 'a.tif'"):
         np.asarray(open_images(path))
 

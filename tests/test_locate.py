@@ -531,7 +531,7 @@ def test_bad_number_of_processes(calibration, n_jobs, error):
 
 # -------------------- joint fit: what comes out, what must not matter, what is refused (accuracy: test_overlap.py)
 
-JOINT = [*COLUMNS, "x_std_px", "y_std_px", "z_std_um", "brightness", "chi2"]
+JOINT = [*COLUMNS, "x_std_px", "y_std_px", "z_std_um", "amplitude", "chi2"]
 
 
 def joint(image, calibration):
@@ -552,7 +552,7 @@ def test_joint_table(few, calibration):
     assert len(match(measured, few[1], within_px=0.3, within_um=2)) == len(measured) == 4
     assert measured["cm"].between(0.8, 1).all() and measured["cm"].is_monotonic_decreasing
     assert (measured[["x_std_px", "y_std_px"]] < 0.2).all(axis=None) and (measured["z_std_um"] < 2).all()
-    assert measured["brightness"].between(0.8, 1.2).all() and measured["chi2"].between(0.5, 2).all()
+    assert measured["amplitude"].between(0.8, 1.2).all() and measured["chi2"].between(0.5, 2).all()
 
 
 @pytest.mark.parametrize(
@@ -604,11 +604,11 @@ def test_joint_of_any_memory_layout(few, calibration, kind):
 
 @pytest.mark.parametrize(("gain", "level"), [(1, 5000), (1, -700), (3, 0), (0.01, 0), (1e4, 1e6)])
 def test_joint_gain_and_level(few, calibration, gain, level):
-    """Neither moves a particle; brightness has the gain."""
+    """Neither moves a particle; amplitude has the gain."""
     expected = joint(few[0], calibration)
     measured = joint(gain * few[0].astype(float) + level, calibration)
     assert_same(measured, expected, xy_px=0.01, z_um=0.1, cm=1e-3)
-    np.testing.assert_allclose(measured["brightness"], gain * expected["brightness"], rtol=0.01)
+    np.testing.assert_allclose(measured["amplitude"], gain * expected["amplitude"], rtol=0.01)
     np.testing.assert_allclose(measured["chi2"], expected["chi2"], rtol=0.05)
 
 

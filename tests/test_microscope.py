@@ -137,10 +137,10 @@ def test_ends_of_the_library(microscope):
             microscope.light(table([3, 5], [3, 5], [0, z * 1.0002]), (11, 11))
 
 
-def test_brightness_and_diameter(quick):
+def test_amplitude_and_diameter(quick):
     one = table(40, 30, 1)
     light = quick.light(one, (61, 81))
-    np.testing.assert_allclose(quick.light(one.assign(brightness=2.5), (61, 81)), 2.5 * light, rtol=1e-5)
+    np.testing.assert_allclose(quick.light(one.assign(amplitude=2.5), (61, 81)), 2.5 * light, rtol=1e-5)
     np.testing.assert_array_equal(quick.light(one.assign(diameter_um=5.0), (61, 81)), light)
     small = quick.light(one.assign(diameter_um=2.5), (61, 81))
     assert small.sum() == pytest.approx(light.sum() / 4, rel=0.01)  # as the sphere's surface
@@ -268,9 +268,9 @@ GOOD = table([5, 9], [5, 7], [0, 1])
         (GOOD.drop(columns="y_px"), r"got no column \['y_px'\], needed are x_px, y_px and z_um"),
         (GOOD.assign(x_px=[np.nan, 1]), "got NaN or infinity, allowed are finite numbers"),
         (GOOD.assign(y_px=[np.inf, 1]), "got NaN or infinity"),
-        (GOOD.assign(brightness=[np.nan, 1]), "got NaN or infinity"),
-        (GOOD.assign(brightness=[0, 1]), "got a brightness or diameter_um of 0 or below, allowed is above 0"),
-        (GOOD.assign(diameter_um=[5, -5]), "got a brightness or diameter_um of 0 or below"),
+        (GOOD.assign(amplitude=[np.nan, 1]), "got NaN or infinity"),
+        (GOOD.assign(amplitude=[0, 1]), "got a amplitude or diameter_um of 0 or below, allowed is above 0"),
+        (GOOD.assign(diameter_um=[5, -5]), "got a amplitude or diameter_um of 0 or below"),
         (GOOD.assign(z_um=[0, -70]), "got z_um = -70, allowed is from -55.0 to 55.0"),
     ],
 )

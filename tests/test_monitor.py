@@ -26,9 +26,9 @@ from gdptlab.live.own_process import OwnProcess
 SHAPE = (3, 5)
 
 
-def image(share, value=0):
-    """A frame that says which share of ten particles is inside."""
-    return np.full(SHAPE, 100 * value + round(10 * share), dtype=np.uint16)
+def image(fraction, value=0):
+    """A frame that says which fraction of ten particles is inside."""
+    return np.full(SHAPE, 100 * value + round(10 * fraction), dtype=np.uint16)
 
 
 def ten(frame):
@@ -86,7 +86,7 @@ def through(frames, evaluate=ten, triggers=(), **settings):
 
 def trigger(name="w", calls=None, **settings):
     calls = [] if calls is None else calls
-    settings = {"share": inside, "action": lambda r: calls.append(("on", r.frame))} | settings
+    settings = {"fraction": inside, "action": lambda r: calls.append(("on", r.frame))} | settings
     return Trigger(name=name, released=lambda r: calls.append(("off", r.frame)), **settings)
 
 
@@ -186,7 +186,7 @@ def test_a_frame_can_bring_its_own_time():
 
 
 @pytest.mark.parametrize(
-    ("on", "share", "count", "after"),
+    ("on", "fraction", "count", "after"),
     [
         (False, 0.9, 10, True),
         (False, 0.89, 10, False),
@@ -198,21 +198,21 @@ def test_a_frame_can_bring_its_own_time():
         (True, np.nan, 10, True),
     ],
 )
-def test_a_trigger_has_hysteresis_and_a_least_count(on, share, count, after):
-    assert trigger().after(on, share, count) is after
+def test_a_trigger_has_hysteresis_and_a_least_count(on, fraction, count, after):
+    assert trigger().after(on, fraction, count) is after
 
 
 def test_actions_are_called_when_the_state_changes_and_only_then():
     calls = []
     act = [trigger("a", calls), trigger("b", [], level=0.5, release=0.5)]
-    shares = [0.1, 0.9, 1.0, 0.8, 0.7, 0.8, 0.9]
-    monitor = through([image(s) for s in shares], triggers=act)
+    fractions = [0.1, 0.9, 1.0, 0.8, 0.7, 0.8, 0.9]
+    monitor = through([image(s) for s in fractions], triggers=act)
     assert calls == [("on", 1), ("off", 4), ("on", 6)]
     recent = monitor.recent()
     assert recent["on_a"].tolist() == [False, True, True, True, False, False, True]
-    np.testing.assert_allclose(recent["share_a"], shares)
+    np.testing.assert_allclose(recent["fraction_a"], fractions)
     assert monitor.status().on == {"a": True, "b": True}
-    assert monitor.status().share == {"a": 0.9, "b": 0.9}
+    assert monitor.status().fraction == {"a": 0.9, "b": 0.9}
     assert monitor.latest.changed == ("a",)
 
 
@@ -221,9 +221,9 @@ def test_the_middle_third_is_that_of_the_replay():
     table = pd.DataFrame({"y": rng.uniform(-45, 45, 40), "z_um": rng.uniform(-30, 30, 40)})
     expected = replay.fractions(table.rename(columns={"y": "y_um"}).assign(frame=0), [0], channel).iloc[0]
     for of in "hw":
-        share = MiddleThird(of=of, channel=channel, to_channel=lambda t: t.assign(y_um=t["y"]))
-        assert share(table) == expected[f"fraction_{of}"] > 0.1
-        assert np.isnan(share(table[:0]))
+        fraction = MiddleThird(of=of, channel=channel, to_channel=lambda t: t.assign(y_um=t["y"]))
+        assert fraction(table) == expected[f"fraction_{of}"] > 0.1
+        assert np.isnan(fraction(table[:0]))
 
 
 def test_both_thirds_convert_a_table_once():
@@ -384,7 +384,7 @@ def test_the_log_holds_what_was_seen(tmp_path):
     runs = [through([image(s) for s in (0.2, 0.9)], triggers=[trigger("a")], log=path) for _ in range(2)]
     log, particles = read_log(path)
     assert log["run"].tolist() == [0, 0, 1, 1] and log["frame"].tolist() == [0, 1, 0, 1]
-    assert log["share_a"].tolist() == [0.2, 0.9] * 2 and log["on_a"].tolist() == [False, True] * 2
+    assert log["fraction_a"].tolist() == [0.2, 0.9] * 2 and log["on_a"].tolist() == [False, True] * 2
     assert (log["t_s"] <= log["decision_s"]).all() and (log["decision_s"] <= log["done_s"]).all()
     assert log["decision_s"].iloc[-1] == runs[1].latest.decision_s
     assert particles.groupby(["run", "frame"]).size().tolist() == [10] * 4
@@ -395,8 +395,8 @@ def test_the_log_holds_what_was_seen(tmp_path):
 
 
 def test_the_log_can_leave_particles_out_and_nan_is_null(tmp_path):
-    through([image(0.2)], triggers=[trigger(share=lambda t: np.nan)], log=tmp_path / "log", log_particles=False)
-    assert '"share":{"w":null}' in (tmp_path / "log").read_text()
+    through([image(0.2)], triggers=[trigger(fraction=lambda t: np.nan)], log=tmp_path / "log", log_particles=False)
+    assert '"fraction":{"w":null}' in (tmp_path / "log").read_text()
     assert read_log(tmp_path / "log")[1].empty
 
 
@@ -550,7 +550,7 @@ def test_a_process_of_its_own_finds_the_same(few, calibration):
         (lambda: Monitor([], ten, example=[1]), ValueError, "example: got shape"),
         (lambda: trigger(""), TypeError, "name: got ''"),
         (lambda: trigger(action=None), TypeError, "action: got None"),
-        (lambda: trigger(share=0.9), TypeError, "share: got 0.9"),
+        (lambda: trigger(fraction=0.9), TypeError, "fraction: got 0.9"),
         (lambda: trigger(level=0.5), ValueError, "release: got 0.8, allowed is up to level, 0.5"),
         (lambda: trigger(level=-1), ValueError, "level: got -1"),
         (lambda: trigger(least=-1), ValueError, "least: got -1"),

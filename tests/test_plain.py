@@ -32,7 +32,7 @@ def both(frames, true, calibration, refine):
     return result
 
 
-def share_error(result, name):
+def fraction_error(result, name):
     """Standard error of the difference of two recalls, or two precisions."""
     count = result["n_true" if name == "recall" else "n_measured"]
     mean = result["n_matched"].sum() / count.sum()
@@ -64,7 +64,7 @@ def test_isolated_particles_as_locate(isolated, calibration, refine):
 def test_overlapping_particles_no_worse_with_locate(random, calibration, refine):
     result = both(*random, calibration, refine)
     for name in ("recall", "precision"):
-        assert result.at["locate", name] >= result.at["plain", name] - CONFIDENCE * share_error(result, name)
+        assert result.at["locate", name] >= result.at["plain", name] - CONFIDENCE * fraction_error(result, name)
     assert result["recall"].between(0.4, 0.7).all() and (result["precision"] > 0.75).all()
     assert (result["sigma_z_um"] < 3.5).all()
 

@@ -24,7 +24,7 @@ def nothing_left_open():
 
 @pytest.fixture(scope="module")
 def monitor() -> pd.DataFrame:
-    """A film of 5 s whose shares rise evenly, the measured ones 0.4 s late."""
+    """A film of 5 s whose fractions rise evenly, the measured ones 0.4 s late."""
     t = np.arange(25) / 5
     true, late = np.minimum(0.3 + 0.3 * t, 1), np.minimum(0.2 + 0.3 * t, 1)
     columns = {"seed": 1, "image_type": "fluorescent", "frame": np.arange(0, 125, 5), "t_s": t, "count": 20}
@@ -70,12 +70,12 @@ def test_forces_and_flow_have_units() -> None:
 
 
 def test_focusing_in_time(monitor: pd.DataFrame) -> None:
-    share = {a: monitor["true_fraction_h"] for a in "hw"}
-    figure = plots.focusing_in_time(monitor["t_s"], share, monitor, {"h": 2.0, "w": 2.0}, 0.9)
+    fraction = {a: monitor["true_fraction_h"] for a in "hw"}
+    figure = plots.focusing_in_time(monitor["t_s"], fraction, monitor, {"h": 2.0, "w": 2.0}, 0.9)
     assert "= 2.00 s" in texts(figure)
 
 
-def test_monitor_marks_when_each_measured_share_first_reaches_the_level(monitor: pd.DataFrame) -> None:
+def test_monitor_marks_when_each_measured_fraction_first_reaches_the_level(monitor: pd.DataFrame) -> None:
     figure = plots.monitor_in_time(monitor)
     marked = [line.get_xdata()[0] for line in figure.axes[0].get_lines() if line.get_marker() == "v"]
     assert marked == pytest.approx([2.4, 2.4])
@@ -99,7 +99,7 @@ def test_error_against_tau(points: pd.DataFrame) -> None:
 
 def test_templates_and_densities_say_how_many_failed(points: pd.DataFrame) -> None:
     points = points.assign(density=[25.0, 25.0, 50.0] * 2, size=[31, 61, 31] * 2)
-    found = pd.DataFrame({"density": [25.0, 50.0], "size": 31, "t_s": 0.0, "share": 0.9})
+    found = pd.DataFrame({"density": [25.0, 50.0], "size": 31, "t_s": 0.0, "fraction": 0.9})
     shown = texts(plots.templates_and_densities(points, found))
     assert all(word in shown for word in ("0/10", "× 2/10", "× 10/10", "50 particles in view"))
 
@@ -109,7 +109,7 @@ def test_one_moment_of_the_replay(film: Film, monitor: pd.DataFrame) -> None:
     figure = plots.replay_view(film, measured, monitor, 50)
     here = int((measured["frame"] == 50).sum())
     assert f"{here} measured (dots) of {here} (crosses)" in texts(figure)
-    shared = [a for a in figure.axes if a.get_ylabel() == "share of particles"]
+    shared = [a for a in figure.axes if a.get_ylabel() == "fraction of particles"]
     assert max(line.get_xdata()[-1] for line in shared[0].get_lines()[1:]) == pytest.approx(2.0)
 
 

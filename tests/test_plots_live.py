@@ -36,7 +36,7 @@ def seen(image):
 @pytest.fixture
 def monitor():
     thirds = middle_thirds(CHANNEL, to_channel).values()
-    triggers = [Trigger(name=third.of, share=third, action=str) for third in thirds]
+    triggers = [Trigger(name=third.of, fraction=third, action=str) for third in thirds]
     frames = iter([np.full((90, 40), n, np.uint8) for n in (4, 9)])
     monitor = Monitor(lambda: slowly(monitor, frames), seen, triggers)
     with monitor:
@@ -59,12 +59,12 @@ def panel_of(monitor, **changed):
 
 def test_the_panel_shows_the_last_frame_and_the_past(monitor):
     figure = panel_of(monitor)
-    frame, section, words, shares, late = figure.axes
+    frame, section, words, fractions, late = figure.axes
     assert frame.get_title(loc="left") == "frame 1: 10 particles"
     np.testing.assert_array_equal(frame.images[0].get_array(), np.full((90, 40), 9))
     np.testing.assert_array_equal(frame.collections[0].get_offsets()[:, 0], np.arange(10))
     np.testing.assert_array_equal(section.collections[0].get_offsets()[[0, 9]], [[1, 3], [50, 3]])
-    lines = {line.get_label(): line.get_ydata() for line in shares.get_lines()}
+    lines = {line.get_label(): line.get_ydata() for line in fractions.get_lines()}
     np.testing.assert_allclose(lines["h/3"], [1, 1])
     np.testing.assert_allclose(lines["w/3"], [0.4, 0.9])
     np.testing.assert_array_equal(late.get_lines()[0].get_ydata(), monitor.recent()["latency_ms"])
@@ -106,12 +106,14 @@ def test_latencies_fall_from_left_to_right():
 
 def test_one_loop_and_many():
     true = pd.DataFrame({"t_s": [0.0, 1.0], "fraction_w": [0.3, 0.95]})
-    recent = pd.DataFrame({"t_s": [0.1, 0.9], "share": [0.3, 0.9]})
+    recent = pd.DataFrame({"t_s": [0.1, 0.9], "fraction": [0.3, 0.9]})
     (axes,) = plots.one_loop(recent, true, 0.95, 0.9).axes
     assert axes.texts[0].get_text() == "sound off at 0.95 s"
     loop = pd.DataFrame({"energy_density_J_m3": [4.0, 6.0], "needed_s": [1.2, 0.9], "off_s": [1.3, 1.0]})
-    loop["true_share"] = [0.95, 0.89]
-    timers = pd.DataFrame({"seed": [1, 2, 1, 2], "off_s": [0.5, 0.5, 1.5, 1.5], "true_share": [0.5, 0.95, 0.93, 0.99]})
+    loop["true_fraction"] = [0.95, 0.89]
+    timers = pd.DataFrame(
+        {"seed": [1, 2, 1, 2], "off_s": [0.5, 0.5, 1.5, 1.5], "true_fraction": [0.5, 0.95, 0.93, 0.99]}
+    )
     left, right = plots.loop_and_timer(loop, timers, 0.9, {"nominal": 1.1}).axes
     np.testing.assert_array_equal(left.get_lines()[1].get_xydata(), [[4, 1.3], [6, 1]])
     np.testing.assert_array_equal(right.get_lines()[0].get_xydata(), [[0.5, 50], [1.5, 0]])

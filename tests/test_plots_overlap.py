@@ -59,7 +59,7 @@ def test_error_ratios_keep_what_is_beyond_the_scale() -> None:
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["normal", "few, n = 4"]
 
 
-def test_film_followed_marks_where_a_measured_share_reaches_the_level() -> None:
+def test_film_followed_marks_where_a_measured_fraction_reaches_the_level() -> None:
     t = np.array([0.0, 1.0, 2.0])
     never = pd.DataFrame({"t_s": t, "valid": [0.3, 0.2, 0.1], "fraction_h": 0.4, "fraction_w": [np.nan, 0.2, 0.3]})
     good = pd.DataFrame({"t_s": t, "valid": 1.0, "fraction_h": [0.5, 0.95, 1.0], "fraction_w": [0.4, 0.6, 0.92]})

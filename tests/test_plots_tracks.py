@@ -4,11 +4,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+from gdptlab.plots.figures import MARK
 
 from gdptlab import plots
 from gdptlab.experiment.channel import Acoustics, Channel, Focusing
 from gdptlab.experiment.film import Film
-from gdptlab.plots.figures import MARK
 
 FPS = 25.0
 
@@ -78,7 +78,7 @@ def test_profiles_of_exact_velocities_lie_on_the_curves(film, moving):
     assert [t.get_text() for t in figure.axes[0].get_legend().get_texts()] == ["|z| < 9 µm", "18 < |z| < 27 µm"]
 
 
-def test_links_in_time_show_both_shares():
+def test_links_in_time_show_both_fractions():
     scores = pd.DataFrame({"right": [1.0, 0.9], "found": [0.8, 0.5]}, index=[0.5, 1.5])
     right, found = plots.links_in_time({"thin": scores, "dense": scores / 2}).axes
     assert [line.get_ydata().tolist() for line in right.get_lines()] == [[1.0, 0.9], [0.5, 0.45]]

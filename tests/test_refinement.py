@@ -57,7 +57,7 @@ def test_terms_that_are_not_linear_matter(microscope, solve, monkeypatch):
     assert curved < linear / 3
 
 
-def test_background_level_slope_and_brightness_do_not_matter(microscope, solve):
+def test_background_level_slope_and_amplitude_do_not_matter(microscope, solve):
     y, x = np.indices((SIZE_PX, SIZE_PX))
     seen = windows(microscope, 0.2, -0.3, 0.4)
     other = (1.7 * seen + (40 - 0.7 * x + 1.1 * y)).astype(np.float32)

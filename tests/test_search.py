@@ -52,7 +52,7 @@ def test_random_positions(microscope, calibrations, kind, n):
         tables.append(true.assign(frame=frame))
     measured, true = (pd.concat(t, ignore_index=True) for t in (frames, tables))
     assert_found(scores(measured, true), n)
-    assert measured["brightness"].median() == pytest.approx(1, abs=0.02)
+    assert measured["amplitude"].median() == pytest.approx(1, abs=0.02)
     assert 0.8 < measured["chi2"].median() < 1.4
     assert (measured["cm"].groupby(measured["frame"]).diff().dropna() <= 0).all()
 
@@ -122,21 +122,21 @@ def test_scattered_brightness(microscope, calibration, crowd):
     """By ten per cent."""
     true, _ = crowd
     rng = np.random.default_rng(240)
-    true = true.assign(brightness=rng.normal(1, 0.1, len(true)))
+    true = true.assign(amplitude=rng.normal(1, 0.1, len(true)))
     measured = joint(microscope.render(true, rng=rng), calibration)
     assert_found(scores(measured, true))
     pairs = match(measured, true)
-    bright = measured.loc[pairs["measured"], "brightness"].to_numpy()
-    assert np.corrcoef(bright, true.loc[pairs["true"], "brightness"])[0, 1] > 0.7
+    bright = measured.loc[pairs["measured"], "amplitude"].to_numpy()
+    assert np.corrcoef(bright, true.loc[pairs["true"], "amplitude"])[0, 1] > 0.7
 
 
 @pytest.mark.parametrize("illumination", [0.6, 1.5])
 def test_other_illumination(microscope, calibration, crowd, illumination):
     true, _ = crowd
-    frame = microscope.render(true.assign(brightness=illumination), rng=241)
+    frame = microscope.render(true.assign(amplitude=illumination), rng=241)
     measured = joint(frame, calibration)
     assert_found(scores(measured, true), errors=1 / min(illumination, 1))
-    assert measured["brightness"].median() == pytest.approx(illumination, rel=0.03)
+    assert measured["amplitude"].median() == pytest.approx(illumination, rel=0.03)
 
 
 @pytest.mark.parametrize("noisy_stack", [False, True])
@@ -313,10 +313,10 @@ def test_depths_are_less_the_bias_of_the_calibration(microscope):
 
 def test_an_odd_brightness_widens_error_bars(microscope, calibration):
     """One that is brighter than all others by three tenths may be two."""
-    true = on_grid(np.random.default_rng(284), (300, 400), 90).assign(brightness=1.0)
+    true = on_grid(np.random.default_rng(284), (300, 400), 90).assign(amplitude=1.0)
     stds = []
     for brightness in (1.0, 1.3):
-        true.loc[4, "brightness"] = brightness
+        true.loc[4, "amplitude"] = brightness
         found = joint(microscope.render(true, (300, 400), rng=285), calibration)
         away = np.hypot(found["x_px"] - true["x_px"][4], found["y_px"] - true["y_px"][4])
         assert away.min() < 1

@@ -26,7 +26,7 @@ def test_joint_is_chosen_for_particles_that_are_alike(few, calibration, microsco
     frame, particles = few
     rng = np.random.default_rng(8)
     more = pd.concat([particles, particles.assign(x_px=particles["x_px"] - 16, z_um=-particles["z_um"])])
-    crowd = [microscope.render(more.assign(brightness=b), frame.shape, rng=rng) for b in (1.0, np.geomspace(0.2, 5, 8))]
+    crowd = [microscope.render(more.assign(amplitude=b), frame.shape, rng=rng) for b in (1.0, np.geomspace(0.2, 5, 8))]
     methods = [choose_settings([image], calibration).arguments["method"] for image in crowd]
     assert methods == ["joint", "correlation"]
     assert choose_settings([frame], calibration).arguments["method"] == "correlation"  # too few to tell
@@ -59,7 +59,7 @@ def test_blank_frames_have_no_particles(calibration) -> None:
         ({"threshold": "low"}, TypeError, "threshold: got 'low'"),
         ({"method": "guess"}, ValueError, "method: got 'guess', allowed are"),
         ({"method": "joint", "threshold": 0.5}, ValueError, "threshold: got one with method 'joint'"),
-        ({"false_share": 1}, ValueError, "false_share: got 1, allowed is above 0 and below 1"),
+        ({"false_fraction": 1}, ValueError, "false_fraction: got 1, allowed is above 0 and below 1"),
         ({"looked_at": 0}, ValueError, "looked_at: got 0"),
         ({"min_distance_px": -1}, ValueError, "min_distance_px: got -1"),
         ({"frames": [np.full((80, 80), np.nan)]}, ValueError, "image: got NaN"),

@@ -353,7 +353,7 @@ class Trajectories:
 
         Far enough is the peak speed times `duration_s`. How far a particle drifts does not depend on its
         start along x, so at any time the view holds an even draw of all paths: the count in it stays binomial
-        around `mean_in_view`, and its share in the middle thirds is that of the whole population.
+        around `mean_in_view`, and its fraction in the middle thirds is that of the whole population.
 
         Parameters
         ----------

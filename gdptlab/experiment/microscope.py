@@ -38,7 +38,7 @@ class Microscope:
     """A microscope with one camera, and the particles it looks at.
 
     The defaults give the paper's images: 5 µm spheres, a 10x/0.3 objective, astigmatism, 0.65 µm per pixel.
-    Focal lengths, refractive indices and brightness are not in the paper; they are ours.
+    Focal lengths, refractive indices and amplitude are not in the paper; they are ours.
 
     Attributes
     ----------
@@ -206,7 +206,7 @@ class Microscope:
         Parameters
         ----------
         particles : DataFrame
-            Columns `x_px`, `y_px` (the first pixel's centre is (0, 0)) and `z_um`; optionally `brightness`
+            Columns `x_px`, `y_px` (the first pixel's centre is (0, 0)) and `z_um`; optionally `amplitude`
             (1 is normal) and `diameter_um`. Particles outside the frame shine in as far as their images reach.
         shape : (rows, columns)
         image_type : str or callable
@@ -235,23 +235,23 @@ class Microscope:
         sub-pixel offsets (`Library`) and placed from there by linear interpolation.
         """
         shape = tuple(whole(f"shape[{i}]", n, 1, 2**20) for i, n in enumerate(shape))
-        places, brightness, diameters = self._checked(particles)
+        places, amplitude, diameters = self._checked(particles)
         frame = np.zeros(shape, dtype=np.float32)
         for diameter in np.unique(diameters).tolist():
             library = _library(self, diameter)
             of_this = diameters == diameter
-            scales = brightness[of_this] * (diameter / self.diameter_um) ** 2
+            scales = amplitude[of_this] * (diameter / self.diameter_um) ** 2
             for (x, y, z), scale in zip(places[of_this].tolist(), scales.tolist(), strict=True):
                 library.place(frame, x, y, z, scale)
         return frame
 
     def _checked(self, particles: pd.DataFrame) -> tuple[NDArray, NDArray, NDArray]:
-        """Places (n, 3), brightness (n,) and diameters (n,) of particles that can be rendered."""
+        """Places (n, 3), amplitude (n,) and diameters (n,) of particles that can be rendered."""
         missing = {"x_px", "y_px", "z_um"} - set(particles)
         if missing:
             raise ValueError(f"particles: got no column {sorted(missing)}, needed are x_px, y_px and z_um")
         places = particles[["x_px", "y_px", "z_um"]].to_numpy(dtype=float)
-        defaults = {"brightness": 1.0, "diameter_um": self.diameter_um}
+        defaults = {"amplitude": 1.0, "diameter_um": self.diameter_um}
         sizes = [
             particles[name].to_numpy(dtype=float) if name in particles else np.full(len(places), value)
             for name, value in defaults.items()
@@ -259,7 +259,7 @@ class Microscope:
         if not all(np.isfinite(values).all() for values in (places, *sizes)):
             raise ValueError("particles: got NaN or infinity, allowed are finite numbers")
         if not all((values > 0).all() for values in sizes):
-            raise ValueError("particles: got a brightness or diameter_um of 0 or below, allowed is above 0")
+            raise ValueError("particles: got a amplitude or diameter_um of 0 or below, allowed is above 0")
         deepest, z_um = self.depth_um / 2 + MARGIN_UM, places[:, 2]
         if len(z_um) and np.abs(z_um).max() > deepest:
             worst = z_um[np.abs(z_um).argmax()]
@@ -330,9 +330,9 @@ class Library:
         """Add the light of one particle to `frame`, times `scale`."""
         depth = (z_um - self.z_um[0]) / (self.z_um[1] - self.z_um[0])
         slice_, between = int(depth), depth - int(depth)
-        for k, share in ((slice_, 1 - between), (slice_ + 1, between)):
-            if share > 0:
-                _place(frame, self.entries[k], x_px, y_px, share * scale)
+        for k, fraction in ((slice_, 1 - between), (slice_ + 1, between)):
+            if fraction > 0:
+                _place(frame, self.entries[k], x_px, y_px, fraction * scale)
 
 
 def _place(frame: NDArray, entry: NDArray, x_px: float, y_px: float, scale: float) -> None:
@@ -343,14 +343,14 @@ def _place(frame: NDArray, entry: NDArray, x_px: float, y_px: float, scale: floa
     if bottom <= 0 or right <= 0 or top >= frame.shape[0] or left >= frame.shape[1]:
         return
     cut = slice(max(-top, 0), bottom - top), slice(max(-left, 0), right - left)
-    share_x = np.array([1 - fx, fx], dtype=np.float32)
-    upper, lower = (share_x @ entry[j, kx : kx + 2].reshape(2, -1) for j in (ky, ky + 1))
+    fraction_x = np.array([1 - fx, fx], dtype=np.float32)
+    upper, lower = (fraction_x @ entry[j, kx : kx + 2].reshape(2, -1) for j in (ky, ky + 1))
     image = (np.float32(scale * (1 - fy)) * upper + np.float32(scale * fy) * lower).reshape(entry.shape[-2:])
     frame[max(top, 0) : bottom, max(left, 0) : right] += image[cut]
 
 
 def _fine_offset(position: float) -> tuple[int, int, float]:
-    """Split a position into whole pixel, fine pixel in it, and the share of the next fine pixel."""
+    """Split a position into whole pixel, fine pixel in it, and the fraction of the next fine pixel."""
     whole_px = int(np.floor(position))
     fine = (position - whole_px) * OVERSAMPLING
     k = min(int(fine), OVERSAMPLING - 1)  # a hair below a whole number, fine is rounded up to OVERSAMPLING
@@ -394,7 +394,7 @@ def _sobol(log2_rays: int) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=16)
 def _light_at_zero(microscope: Microscope) -> float:
-    """Mean weight of a ray from z = 0, the unit of brightness."""
+    """Mean weight of a ray from z = 0, the unit of amplitude."""
     return float(microscope.trace(0.0, _spread(2**16, np.random.default_rng(0)))[2].mean())
 
 

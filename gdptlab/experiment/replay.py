@@ -507,10 +507,10 @@ def errors(
     return pd.DataFrame(rows, columns=[*keys, *columns, "dropped", "fired", "possible", "failed"])
 
 
-def _clock(times: NDArray, tau: float | NDArray, share: float) -> tuple:
+def _clock(times: NDArray, tau: float | NDArray, fraction: float) -> tuple:
     """Mean τ, phase, and the columns of `watch` (frames dropped so far) as lists, but for the index."""
     mean = float(np.mean(tau))
-    phase = share * (max(mean, times[1] - times[0]) if len(times) > 1 else mean)
+    phase = fraction * (max(mean, times[1] - times[0]) if len(times) > 1 else mean)
     used = watch(times, tau, phase)
     lists = (used["t_s"].tolist(), used["decision_s"].tolist(), used["dropped"].cumsum().tolist())
     return mean, phase, used["index"].to_numpy(), *lists

@@ -9,7 +9,7 @@ from gdptlab.experiment.channel import Channel
 
 
 def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.DataFrame:
-    """Share of particles in the middle third of height and width, frame by frame.
+    """Fraction of particles in the middle third of height and width, frame by frame.
 
     Parameters
     ----------
@@ -41,11 +41,11 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
     count = np.bincount(place, minlength=len(frames))
     inside = {f"fraction_{of}": in_middle_third(table, of, channel) for of in "hw"}
     empty = np.where(count > 0, 0.0, np.nan)
-    shares = {
+    fractions = {
         name: np.bincount(place, weights=yes, minlength=len(frames)) / np.maximum(count, 1) + empty
         for name, yes in inside.items()
     }
-    return pd.DataFrame({"frame": frames, "count": count} | shares)
+    return pd.DataFrame({"frame": frames, "count": count} | fractions)
 
 
 def in_middle_third(table: pd.DataFrame, of: str, channel: Channel) -> NDArray[np.bool_]:

@@ -34,17 +34,17 @@ def explained(
     else:
         found = plan.following(image, before)
     fit = found.fit
-    y, x, step, brightness = fit.places.T
+    y, x, step, amplitude = fit.places.T
     z_um = calibration.z_um
     table = as_table(fit.places[:, :2], step, fit.cm, np.clip(z_um - calibration.own_bias_um, z_um[0], z_um[-1]))
     steps = np.arange(len(calibration))
     y_std, x_std, step_std = fit.std.T
     stds = x_std, y_std, step_std * np.interp(step, steps, np.gradient(z_um))
-    odd = (brightness - found.brightness) / found.spread
+    odd = (amplitude - found.amplitude) / found.spread
     misfit = np.sqrt(1 + CORRELATED * np.maximum(fit.chi2 - 1, 0) + (odd / ODD) ** 2)
     for name, noise, own in zip(STD_COLUMNS, stds, calibration.own_error.T, strict=True):
         table[name] = misfit * np.hypot(noise, np.interp(step, steps, own))
     inside = found.stays & (y >= -0.5) & (y < image.shape[0] - 0.5) & (x >= -0.5) & (x < image.shape[1] - 0.5)
-    table["brightness"], table["chi2"] = brightness, fit.chi2
+    table["amplitude"], table["chi2"] = amplitude, fit.chi2
     order = np.argsort(-table["cm"].to_numpy(), kind="stable")
     return table.iloc[order[inside[order]]].reset_index(drop=True), found

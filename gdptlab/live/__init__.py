@@ -7,7 +7,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "monitor": ["Frame", "MiddleThird", "Monitor", "Result", "Status", "Trigger", "at_speed", "middle_thirds"],
-        "device": ["Device", "Switched", "closed_loop", "switched", "timed", "true_shares"],
+        "device": ["Device", "Switched", "closed_loop", "switched", "timed", "true_fractions"],
         "own_process": ["OwnProcess"],
         "logbook": ["Logbook", "read_log"],
     },

@@ -268,8 +268,8 @@ def _camera(orders: Any, bell: Any, shared: _Shared, shape: tuple[int, int]) -> 
 # -------------------- sound switched by a monitor, or by a timer
 
 
-def true_shares(film: Film, times_s: ArrayLike) -> pd.DataFrame:
-    """Share of the particles in view that are in the middle thirds, by the truth.
+def true_fractions(film: Film, times_s: ArrayLike) -> pd.DataFrame:
+    """Fraction of the particles in view that are in the middle thirds, by the truth.
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ def closed_loop(
     of : str
         'h' or 'w': of which middle third.
     level : float
-        Share at which the sound is switched off (paper: 0.9).
+        Fraction at which the sound is switched off (paper: 0.9).
     linger_s : float
         For which it goes on afterwards.
     log : str or path-like, optional
@@ -316,9 +316,9 @@ def closed_loop(
     Returns
     -------
     dict
-        `seed`, `energy_density_J_m3`; `needed_s`, when the true share reached the level (NaN: never); `off_s`, when the
-        sound was switched off, and `true_share` then; `exposed_s` and `delivered_s`, the two times of the frame that
-        did it, and `share`, what was measured in it: all NaN if it never was; `delay_ms` from its delivery and
+        `seed`, `energy_density_J_m3`; `needed_s`, when the true fraction reached the level (NaN: never); `off_s`, when
+        the sound was switched off, and `true_fraction` then; `exposed_s` and `delivered_s`, the two times of the frame that
+        did it, and `fraction`, what was measured in it: all NaN if it never was; `delay_ms` from its delivery and
         `exposure_delay_ms` from its exposure until the sound was off; `frames` that the camera delivered until the
         end, and `dropped`.
     """
@@ -330,7 +330,7 @@ def closed_loop(
         device.switch_off()
         off.set()
 
-    trigger = Trigger(name=of, share=middle, action=act, level=level)
+    trigger = Trigger(name=of, fraction=middle, action=act, level=level)
     device.run(film)
     with Monitor(device, evaluate, [trigger], example=film[0], log=log) as monitor:
         if off.wait(len(film) / film.frame_rate_hz):
@@ -341,17 +341,17 @@ def closed_loop(
     row = {
         "seed": film.seed,
         "energy_density_J_m3": film.trajectories.focusing.acoustics.energy_density_J_m3,
-        "needed_s": trigger_time(times, true_shares(film, times)[f"fraction_{of}"], level),
+        "needed_s": trigger_time(times, true_fractions(film, times)[f"fraction_{of}"], level),
     }
-    fields = ("off_s", "true_share", "exposed_s", "delivered_s", "share", "delay_ms", "exposure_delay_ms")
+    fields = ("off_s", "true_fraction", "exposed_s", "delivered_s", "fraction", "delay_ms", "exposure_delay_ms")
     row |= dict.fromkeys(fields, np.nan)
     if off.is_set():
         first = seen[seen[f"on_{of}"]].iloc[0]
         row["off_s"] = device.off_s
-        row["true_share"] = true_shares(film, [device.off_s])[f"fraction_{of}"].iloc[0]
+        row["true_fraction"] = true_fractions(film, [device.off_s])[f"fraction_{of}"].iloc[0]
         row["exposed_s"] = device.shown[int(first["frame"])] / film.frame_rate_hz
         row["delivered_s"] = first["t_s"] + monitor.started_s - device.start_s
-        row["share"] = first[f"share_{of}"]
+        row["fraction"] = first[f"fraction_{of}"]
         row["delay_ms"] = 1e3 * (device.off_s - row["delivered_s"])
         row["exposure_delay_ms"] = 1e3 * (device.off_s - row["exposed_s"])
     return row | {"frames": status.grabbed, "dropped": status.dropped}
@@ -371,12 +371,12 @@ def timed(films: Iterable[Film], timers_s: ArrayLike, of: str = "w") -> pd.DataF
     Returns
     -------
     DataFrame
-        A row for each film and setting: `seed`, `energy_density_J_m3`, `off_s`, `true_share`.
+        A row for each film and setting: `seed`, `energy_density_J_m3`, `off_s`, `true_fraction`.
     """
     choice("of", of, "hw")
     parts = []
     for film in films:
         energy = film.trajectories.focusing.acoustics.energy_density_J_m3
-        table = true_shares(film, timers_s).rename(columns={"t_s": "off_s", f"fraction_{of}": "true_share"})
-        parts.append(table[["off_s", "true_share"]].assign(seed=film.seed, energy_density_J_m3=energy))
+        table = true_fractions(film, timers_s).rename(columns={"t_s": "off_s", f"fraction_{of}": "true_fraction"})
+        parts.append(table[["off_s", "true_fraction"]].assign(seed=film.seed, energy_density_J_m3=energy))
     return pd.concat(parts, ignore_index=True)

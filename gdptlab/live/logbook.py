@@ -157,7 +157,7 @@ def read_log(path: str | os.PathLike[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
     -------
     frames : DataFrame
         A row for each frame that was looked at: `run` (a file may hold several, from 0), `frame`, `t_s`,
-        `decision_s`, `done_s`, `dropped`, `count`, `error`, `action_error`, and for each trigger `share_NAME`
+        `decision_s`, `done_s`, `dropped`, `count`, `error`, `action_error`, and for each trigger `fraction_NAME`
         and `on_NAME` (see `monitor.Result`).
     particles : DataFrame
         `run`, `frame` and the columns of the evaluator's table, rounded; empty if it was not logged.
@@ -178,7 +178,7 @@ def read_log(path: str | os.PathLike[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
                 run += line.get("event") == "started"
                 continue
             particles = line.pop("particles", None)
-            for name in ("share", "on"):
+            for name in ("fraction", "on"):
                 line |= {f"{name}_{trigger}": value for trigger, value in line.pop(name).items()}
             rows.append({"run": run} | line)
             if particles:

@@ -84,7 +84,7 @@ def at_speed(frames: Iterable[ArrayLike], rate_hz: float) -> Iterator[ArrayLike]
 
 @dataclass(frozen=True, kw_only=True)
 class MiddleThird:
-    """Share of the particles in the middle third of the channel's height or width: the paper's two triggers.
+    """Fraction of the particles in the middle third of the channel's height or width: the paper's two triggers.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class MiddleThird:
         _function("to_channel", self.to_channel)
 
     def __call__(self, table: pd.DataFrame) -> float:
-        """Share, from 0 to 1; NaN without particles."""
+        """Fraction, from 0 to 1; NaN without particles."""
         inside = in_middle_third(self.to_channel(table), self.of, self.channel)
         return float(inside.mean()) if len(inside) else np.nan
 
@@ -146,13 +146,13 @@ def middle_thirds(channel: Channel, to_channel: Callable[[pd.DataFrame], pd.Data
 class Trigger:
     """When to act.
 
-    It goes on with the first frame whose share is at or above `level`, and off again with the first whose share is
-    below `release`. Between the two, and in a frame with fewer than `least` particles, it stays as it is.
+    It goes on with the first frame whose fraction is at or above `level`, and off again with the first whose fraction
+    is below `release`. Between the two, and in a frame with fewer than `least` particles, it stays as it is.
 
     Attributes
     ----------
     name : str
-    share : callable
+    fraction : callable
         Table of the evaluator -> number, such as a `MiddleThird`. A NaN changes nothing.
     action : callable
         Called with the `Result` when the trigger goes on, in the evaluating thread: the next frame waits for it.
@@ -172,7 +172,7 @@ class Trigger:
     """
 
     name: str
-    share: Callable[[pd.DataFrame], float]
+    fraction: Callable[[pd.DataFrame], float]
     action: Callable[["Result"], object]
     released: Callable[["Result"], object] | None = None
     level: float = 0.9
@@ -182,7 +182,7 @@ class Trigger:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise TypeError(f"name: got {self.name!r}, allowed is a word")
-        for part in ("share", "action", "released"):
+        for part in ("fraction", "action", "released"):
             if part != "released" or self.released is not None:
                 _function(part, getattr(self, part))
         positive("level", self.level)
@@ -190,11 +190,11 @@ class Trigger:
             raise ValueError(f"release: got {self.release:g}, allowed is up to level, {self.level:g}")
         whole("least", self.least, 0, 2**31)
 
-    def after(self, on: bool, share: float, count: int) -> bool:
+    def after(self, on: bool, fraction: float, count: int) -> bool:
         """Whether it is on after a frame, given whether it was on before."""
         if count < self.least:
             return on
-        return bool(share >= (self.release if on else self.level) or (on and np.isnan(share)))
+        return bool(fraction >= (self.release if on else self.level) or (on and np.isnan(fraction)))
 
 
 def _function(name: str, value: Any) -> None:
@@ -220,7 +220,7 @@ class Result:
     image : array (rows, columns), or what else came
     table : DataFrame
         From the evaluator; without rows if there is an error.
-    share : dict
+    fraction : dict
         Of each trigger, by name; empty if there is an error.
     on : dict
         Which triggers are on now.
@@ -236,7 +236,7 @@ class Result:
     dropped: int
     image: Any
     table: pd.DataFrame
-    share: dict[str, float]
+    fraction: dict[str, float]
     on: dict[str, bool]
     changed: tuple[str, ...] = ()
     error: str = ""
@@ -267,7 +267,7 @@ class Status:
         Since the last frame came, or the start.
     count : int
         Particles in the last frame that was evaluated.
-    share, on : dict
+    fraction, on : dict
         Of each trigger, by name.
     actions_failed : int
         Actions of triggers that raised.
@@ -291,7 +291,7 @@ class Status:
     latency_max_ms: float
     waiting_s: float
     count: int
-    share: dict[str, float]
+    fraction: dict[str, float]
     on: dict[str, bool]
     actions_failed: int
     error: str
@@ -368,7 +368,7 @@ class Monitor:
         self._state, self._ended, self.started_s, self._last_s = "ready", False, np.nan, np.nan
         self._grabbed = self._evaluated = self._failed = self._dropped = self._actions_failed = 0
         self._error, self._latest = "", None
-        self._share, self._on, self._count = {}, dict.fromkeys(names, False), 0
+        self._fraction, self._on, self._count = {}, dict.fromkeys(names, False), 0
         window = whole("window", window, 2, 10**6)
         self._arrived: deque[float] = deque(maxlen=window)
         self._rows: deque[dict[str, Any]] = deque(maxlen=window)
@@ -440,7 +440,7 @@ class Monitor:
 
     def recent(self) -> pd.DataFrame:
         """The last frames looked at: `frame`, `t_s` and `decision_s` since the start, `latency_ms`, `dropped`,
-        `count`, `error`, and `share_NAME`, `on_NAME` of each trigger."""
+        `count`, `error`, and `fraction_NAME`, `on_NAME` of each trigger."""
         with self._lock:
             return pd.DataFrame(list(self._rows))
 
@@ -463,7 +463,7 @@ class Monitor:
                 latency_max_ms=float(latency.max()),
                 waiting_s=perf_counter() - since,
                 count=self._count,
-                share=dict(self._share),
+                fraction=dict(self._fraction),
                 on=dict(self._on),
                 actions_failed=self._actions_failed,
                 error=self._error,
@@ -531,11 +531,11 @@ class Monitor:
                 raise TypeError(f"evaluate: got a {type(table).__name__} from it, allowed is a DataFrame")
             if not table.columns.is_unique:
                 raise ValueError(f"evaluate: got columns {list(table)} from it, allowed are different names")
-            share = {t.name: float(t.share(table)) for t in self._triggers}
-            on = {t.name: t.after(self._on[t.name], share[t.name], len(table)) for t in self._triggers}
+            fraction = {t.name: float(t.fraction(table)) for t in self._triggers}
+            on = {t.name: t.after(self._on[t.name], fraction[t.name], len(table)) for t in self._triggers}
             error = ""
         except Exception as caught:
-            table, share, on, error = pd.DataFrame(), {}, self._on, as_text(caught)
+            table, fraction, on, error = pd.DataFrame(), {}, self._on, as_text(caught)
         return Result(
             frame=number,
             t_s=frame.t_s,
@@ -543,7 +543,7 @@ class Monitor:
             dropped=dropped,
             image=frame.image,
             table=table,
-            share=share,
+            fraction=fraction,
             on=on,
             changed=tuple(name for name, value in on.items() if value != self._on[name]),
             error=error,
@@ -574,19 +574,21 @@ class Monitor:
         done_s = perf_counter()
         plain = {"frame": result.frame, "dropped": result.dropped, "count": len(result.table), "error": result.error}
         row = {"t_s": result.t_s - self.started_s, "decision_s": result.decision_s - self.started_s}
-        by_name = {f"share_{n}": s for n, s in result.share.items()} | {f"on_{n}": o for n, o in result.on.items()}
+        by_name = {f"fraction_{n}": s for n, s in result.fraction.items()} | {
+            f"on_{n}": o for n, o in result.on.items()
+        }
         with self._lock:
             self._latest, self._on = result, result.on
             if result.error:
                 self._failed += 1
             else:
-                self._evaluated, self._count, self._share = self._evaluated + 1, len(result.table), result.share
+                self._evaluated, self._count, self._fraction = self._evaluated + 1, len(result.table), result.fraction
             self._actions_failed += len(failures)
             self._error = (failures or [result.error or self._error])[-1]
             self._rows.append(plain | row | {"latency_ms": result.latency_ms} | by_name)
         if self._log is not None:
             line = plain | {"t_s": result.t_s, "decision_s": result.decision_s, "done_s": done_s}
-            line |= {"action_error": "; ".join(failures), "share": result.share, "on": result.on}
+            line |= {"action_error": "; ".join(failures), "fraction": result.fraction, "on": result.on}
             if self._log_particles and len(result.table):
                 columns = result.table.select_dtypes(["number", "bool"])
                 line["particles"] = {name: columns[name].round(DIGITS).tolist() for name in columns}

@@ -105,7 +105,7 @@ def image_size(cut: NDArray, faint: float = 0.06) -> int:
     """Smallest odd size that holds the particle in nearly every slice of (N, 2 r + 1, 2 r + 1).
 
     An image ends where the median over a ring about the centre, which a neighbour does not move, first falls
-    below the share `faint` of the brightest ring's.
+    below the fraction `faint` of the brightest ring's.
     """
     half = cut.shape[-1] // 2
     y, x = np.indices(cut.shape[1:]) - half

@@ -32,7 +32,7 @@ STANDS_OUT = 8.0
 """Height of a bead's spot above what surrounds it, in standard deviations, from which on it is one."""
 
 FAINT = 0.1
-"""Share of the brightness of bright beads below which a spot is not taken for a bead."""
+"""Fraction of the amplitude of bright beads below which a spot is not taken for a bead."""
 
 MOST_BEADS = 40
 """Of those that stand alone, the brightest, that are looked at closely."""
@@ -56,7 +56,7 @@ SPOT = 10
 SAME = 2.0
 """Radius, px, within which the steps from spot to spot are the same."""
 
-SHARES = (1.0, 0.9, 0.8, 0.7)
+FRACTIONS = (1.0, 0.9, 0.8, 0.7)
 """Of the widest image, tried as the size of a template."""
 
 CHECKED = 7
@@ -70,7 +70,7 @@ class ScanReport:
     Attributes
     ----------
     beads : DataFrame
-        A row for each bead of the scan: `x_px`, `y_px`; `brightness`, the height of its spot (counts);
+        A row for each bead of the scan: `x_px`, `y_px`; `amplitude`, the height of its spot (counts);
         `room_px`, the distance to its nearest neighbour or, doubled, to the border; for those looked at closely
         also `clipped`, in how many slices it is cut off at the top or bottom of the camera's range, `alike`, the
         correlation with the average bead, and `offset_um`, how much higher (in z of the scan) than the others it comes
@@ -78,7 +78,7 @@ class ScanReport:
     drift_px : float64 array (N, 2)
         Where the average bead is in each slice (x, y), from its mean place.
     clipped : float64 array (N,)
-        Share of the beads looked at that are clipped in each slice.
+        Fraction of the beads looked at that are clipped in each slice.
     settings : DataFrame
         A row for each choice (the index): `value`, `how` ("by itself" or "given") and `why`.
     overview : float32 array (rows, columns)
@@ -108,7 +108,7 @@ def find_beads(scan: ArrayLike, z_um: ArrayLike) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        A row for each, brightest first: `x_px`, `y_px`, `brightness` (height of the spot, counts; below 0 for
+        A row for each, brightest first: `x_px`, `y_px`, `amplitude` (height of the spot, counts; below 0 for
         dark beads) and `room_px`, the distance to the nearest other bead or twice that to the border.
 
     Raises
@@ -287,8 +287,8 @@ def _table(overview: NDArray[np.float32], places: NDArray) -> pd.DataFrame:
     smooth = gaussian_filter(overview, 1)
     high, low = (extreme(smooth, 2 * SPOT + 1)[row, column] for extreme in (maximum_filter, minimum_filter))
     height = np.where(high > -low, high, low)
-    table = pd.DataFrame({"x_px": x, "y_px": y, "brightness": height, "room_px": np.minimum(nearest, 2 * border)})
-    return table.sort_values("brightness", key=np.abs, ascending=False, ignore_index=True)
+    table = pd.DataFrame({"x_px": x, "y_px": y, "amplitude": height, "room_px": np.minimum(nearest, 2 * border)})
+    return table.sort_values("amplitude", key=np.abs, ascending=False, ignore_index=True)
 
 
 def _window(scan: NDArray, x_px: float, y_px: float, half: int) -> tuple[NDArray[np.float32], float, float]:
@@ -300,7 +300,7 @@ def _window(scan: NDArray, x_px: float, y_px: float, half: int) -> tuple[NDArray
 
 def _size(scan: NDArray, beads: pd.DataFrame) -> int:
     """Median of the sizes that hold the widest image of the beads with most room."""
-    bright = beads[beads["brightness"].abs() > beads["brightness"].abs().median() / 2]
+    bright = beads[beads["amplitude"].abs() > beads["amplitude"].abs().median() / 2]
     half = np.minimum(bright["room_px"] // 2 - 1, LARGEST // 2).nlargest(5).astype(int)
     half = half[half >= max(2, 0.8 * half.max())]  # less would cut a wide image off
     if half.empty:
@@ -319,8 +319,8 @@ def _fitting(stack: NDArray, scan: NDArray, z_um: NDArray, beads: pd.DataFrame) 
     looked = np.rint(np.linspace(0, len(scan) - 1, CHECKED + 2)[1:-1]).astype(int)
     true = pd.concat([beads[["x_px", "y_px"]].assign(frame=k, z_um=z_um[k]) for k in looked], ignore_index=True)
     best, most = stack, 0.0
-    for share, method in ((1.0, "joint"), *((share, "correlation") for share in SHARES)):
-        m = round(n * (1 - share) / 2)
+    for fraction, method in ((1.0, "joint"), *((fraction, "correlation") for fraction in FRACTIONS)):
+        m = round(n * (1 - fraction) / 2)
         cut = stack[:, m : n - m, m : n - m]
         calibration = Calibration.from_stack(cut, z_um, n_sub=min(9, len(scan)))
         found = [locate(scan[k], calibration, method=method).assign(frame=k) for k in looked]
@@ -340,7 +340,7 @@ def _reason(widest: int, size: int) -> str:
 def _averaged(
     scan: NDArray, z_um: NDArray, beads: pd.DataFrame, size: int, *, given: bool
 ) -> tuple[pd.DataFrame, NDArray, NDArray, NDArray]:
-    """Beads with a verdict each, their average stack, its drift (N, 2), and the share clipped in each slice."""
+    """Beads with a verdict each, their average stack, its drift (N, 2), and the fraction clipped in each slice."""
     beads = beads.assign(
         clipped=np.nan,
         alike=np.nan,
@@ -383,7 +383,7 @@ def _averaged(
 def _mean(stacks: NDArray, given: bool) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Average of stacks (b, N, n, n), each moved along z to fit the rest; how alike each is, its lag, and if used.
 
-    Stacks count as they are bright, so that the average has the least noise; it has the brightness of the median.
+    Stacks count as they are bright, so that the average has the least noise; it has the amplitude of the median.
     """
     smooth = np.array([normalised(levelled(denoised(stack))) for stack in stacks])
     lags, used = np.zeros(len(stacks)), np.ones(len(stacks), dtype=bool)
@@ -423,7 +423,7 @@ def _clipped(scan: NDArray, beads: pd.DataFrame, size: int) -> NDArray[np.bool_]
 
     Then more pixels are at the very end than in the next fiftieth of the range.
     """
-    sign = np.sign(beads["brightness"].median())
+    sign = np.sign(beads["amplitude"].median())
     end, other = (scan.max(), scan.min()) if sign > 0 else (scan.min(), scan.max())
     near = np.abs(scan.astype(np.float32) - float(end)) <= abs(float(end) - float(other)) / 50
     at_end = scan == end

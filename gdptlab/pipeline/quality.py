@@ -122,7 +122,7 @@ def report(calibration: Calibration) -> pd.DataFrame:
     )
     own = float((depths["own_error_um"] > depths["z_std_um"]).mean())
     say(
-        "the stack's share",
+        "the stack's fraction",
         False,
         own > 0.5,
         f"at {100 * own:.0f} % of depths the calibration's noise is worse than the frame's",
@@ -146,12 +146,12 @@ def _judge_beads(calibration: Calibration, error_um: float, say: Callable[..., N
         "Noise and quirks of a few beads go into every z. See what the page marks as beads: are they? If so, scan "
         "more, or farther apart; if not, give the places of some in `beads_px`.",
     )
-    share = float(np.mean(made.clipped > 0))
+    fraction = float(np.mean(made.clipped > 0))
     say(
         "clipping",
         bool(made.clipped[calibration.subset].max() > 0.5),
-        share > 0,
-        f"{100 * share:.0f} % of the slices have beads cut off at the end of the camera's range",
+        fraction > 0,
+        f"{100 * fraction:.0f} % of the slices have beads cut off at the end of the camera's range",
         "Expose more briefly: a flat top hides where the focus is.",
     )
     step = float(np.median(np.diff(z_um)))

@@ -28,7 +28,7 @@ DEPTHS = 25
 """Images of the calibration, at most, on which ghosts are counted."""
 
 EVEN = 0.2
-"""Largest spread of brightness, its share, with which the joint fit is chosen: it takes particles to be alike."""
+"""Largest spread of amplitude, its fraction, with which the joint fit is chosen: it takes particles to be alike."""
 
 EXPLAINED = 1.5
 """Largest median chi2 of particles with which the joint fit is chosen."""
@@ -77,7 +77,7 @@ def choose_settings(
     method: str | None = None,
     refine: bool | None = None,
     min_distance_px: float | None = None,
-    false_share: float = 0.01,
+    false_fraction: float = 0.01,
     looked_at: int = 3,
 ) -> Settings:
     """Choose what `locate` is told, from some frames.
@@ -88,18 +88,18 @@ def choose_settings(
         Of the film to be measured; only some are looked at, from the first on.
     calibration : Calibration
     threshold : float, optional
-        Lowest C_m of a particle, used as it is. If not given, the lowest at which no more than `false_share` of the
+        Lowest C_m of a particle, used as it is. If not given, the lowest at which no more than `false_fraction` of the
         finds are false, to judge by the frames with their sign turned and by the ghosts of lone particles.
     method : str, optional
         "correlation" or "joint". If not given, joint where its model holds: where it finds particles alike in
-        brightness (spread at most `EVEN`) and like the calibration's (median C_m at least `LIKE`) and explains what is
+        amplitude (spread at most `EVEN`) and like the calibration's (median C_m at least `LIKE`) and explains what is
         around them (median chi2 at most `EXPLAINED`).
     refine : bool, optional
         Of "correlation"; True if not given.
     min_distance_px : float, optional
         Of "correlation"; a quarter of a template if not given.
-    false_share : float
-        Share of false finds that is put up with.
+    false_fraction : float
+        Fraction of false finds that is put up with.
     looked_at : int
         How many frames are looked at.
 
@@ -113,8 +113,8 @@ def choose_settings(
         If an argument is not of that form, or a frame is refused by `locate`; if a setting is given that the method
         given does not have.
     """
-    if positive("false_share", false_share) >= 1:
-        raise ValueError(f"false_share: got {false_share}, allowed is above 0 and below 1")
+    if positive("false_fraction", false_fraction) >= 1:
+        raise ValueError(f"false_fraction: got {false_fraction}, allowed is above 0 and below 1")
     if threshold is not None and positive("threshold", threshold) > 1:
         raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
     if method is not None:
@@ -147,7 +147,7 @@ def choose_settings(
     reasons = {"refine": "the whole stack is walked", "min_distance_px": "a quarter of a template"}
     if threshold is None:
         finds = (table["cm"] for table in (found, false, ghosts, alone))
-        threshold, reasons["threshold"] = _threshold(*finds, false_share)
+        threshold, reasons["threshold"] = _threshold(*finds, false_fraction)
     if method is not None:
         given["method"] = method
     elif given:
@@ -185,12 +185,12 @@ def _ghosts(calibration: Calibration, noise: float, settings: dict[str, object])
 
 
 def _threshold(
-    found: pd.Series, false: pd.Series, ghosts: pd.Series, alone: pd.Series, share: float
+    found: pd.Series, false: pd.Series, ghosts: pd.Series, alone: pd.Series, fraction: float
 ) -> tuple[float, str]:
-    """Lowest threshold with so small a share of false finds, and the reason in words."""
+    """Lowest threshold with so small a fraction of false finds, and the reason in words."""
     for threshold in np.arange(LOWEST, 0.99, 0.01).round(2).tolist():
         n, n_false, n_ghosts, n_alone = (_above(cm, threshold) for cm in (found, false, ghosts, alone))
-        if n and n_false / n + n_ghosts / max(n_ghosts + n_alone, 1) <= share:
+        if n and n_false / n + n_ghosts / max(n_ghosts + n_alone, 1) <= fraction:
             turned = f"{n} found from there on, {n_false} with the frames' sign turned"
             return threshold, f"{turned}; {n_ghosts} beside {n_alone} lone particles"
     return 0.5, "nothing is found that is not found with the frames' sign turned, too"
@@ -201,9 +201,9 @@ def _method(frame: NDArray, calibration: Calibration) -> tuple[str, str]:
     table = locate(frame, calibration, method="joint")
     if len(table) < 5:
         return "correlation", "too few particles to see if they are alike, as joint takes them to be"
-    brightness, chi2 = table["brightness"], float(table["chi2"].median())
+    amplitude, chi2 = table["amplitude"], float(table["chi2"].median())
     # Of normal numbers, the standard deviation; of a few far brighter ones it takes notice.
-    spread = float((brightness.quantile(0.9) - brightness.quantile(0.1)) / (2.563 * brightness.median()))
+    spread = float((amplitude.quantile(0.9) - amplitude.quantile(0.1)) / (2.563 * amplitude.median()))
     cm = float(table["cm"].median())
     method = "joint" if spread <= EVEN and chi2 <= EXPLAINED and cm >= LIKE else "correlation"
     return method, (

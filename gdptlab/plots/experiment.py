@@ -140,8 +140,8 @@ def fig4_acoustophoresis(trajectories: Trajectories, times_s: Sequence[float]) -
         panel.plot(here["y_um"], here["z_um"], "o", color="black", ms=2.5)
         inside = {"h": np.abs(here["z_um"]) <= h / 6, "w": np.abs(here["y_um"]) <= w / 6}
         panel.set_title(f"t = {t:g} s", loc="center")
-        shares = ",  ".join(f"{share.mean():.0%} in {a}/3" for a, share in inside.items())
-        panel.set(xlabel=f"y (µm)\n{shares}", xticks=(-w / 2, 0, w / 2), yticks=(-h / 2, 0, h / 2))
+        fractions = ",  ".join(f"{fraction.mean():.0%} in {a}/3" for a, fraction in inside.items())
+        panel.set(xlabel=f"y (µm)\n{fractions}", xticks=(-w / 2, 0, w / 2), yticks=(-h / 2, 0, h / 2))
         panel.xaxis.label.set_size("small")
     panels[0].set_ylabel("z (µm)")
     return figure
@@ -184,19 +184,19 @@ def focusing_in_time(
     triggers_s: Mapping[str, float],
     level: float,
 ) -> Figure:
-    """Plot the share of particles in the middle thirds against time, and where it passes the level.
+    """Plot the fraction of particles in the middle thirds against time, and where it passes the level.
 
     Parameters
     ----------
     t_s : array (n,)
     expected : {'h': array (n,), 'w': array (n,)}
-        Share of infinitely many particles.
+        Fraction of infinitely many particles.
     counted : DataFrame
         Of a finite population: `t_s`, `fraction_h`, `fraction_w`.
     triggers_s : {'h': float, 'w': float}
         Trigger times of the infinite population.
     level : float
-        Share that triggers.
+        Fraction that triggers.
 
     Returns
     -------
@@ -211,7 +211,7 @@ def focusing_in_time(
         axes.annotate(
             f"{TRIGGERS[a]} = {triggers_s[a]:.2f} s", (triggers_s[a], level), (4, -16), textcoords="offset points"
         )
-    axes.set(xlabel="t (s)", ylabel="share of particles", ylim=(0.2, 1.03))
+    axes.set(xlabel="t (s)", ylabel="fraction of particles", ylim=(0.2, 1.03))
     axes.legend(loc="lower right")
     return figure
 
@@ -248,12 +248,12 @@ def _monitor(axes: Axes, monitor: pd.DataFrame, marks: bool = True) -> None:
         fired = monitor[monitor[f"fraction_{a}"] >= level]
         if marks and len(fired):
             axes.plot(fired["t_s"].iloc[0], fired[f"fraction_{a}"].iloc[0], "v", color=colour, mec="black", ms=8)
-    axes.set(xlabel="t (s)", ylabel="share of particles", ylim=(0.1, 1.05))
+    axes.set(xlabel="t (s)", ylabel="fraction of particles", ylim=(0.1, 1.05))
 
 
 @styled
 def monitor_in_time(monitor: pd.DataFrame) -> Figure:
-    """Plot what the monitor sees of one film: the two shares with their level, and how many particles.
+    """Plot what the monitor sees of one film: the two fractions with their level, and how many particles.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def monitor_in_time(monitor: pd.DataFrame) -> Figure:
     Returns
     -------
     Figure
-        A triangle is where a measured share first reaches the level.
+        A triangle is where a measured fraction first reaches the level.
     """
     figure, [axes] = panels(2, 10, 3.4, width_ratios=[1.6, 1])
     _monitor(axes[0], monitor)
@@ -427,20 +427,20 @@ def error_against_tau(points: pd.DataFrame, band: pd.DataFrame, *, by: str, tau_
 
 @styled
 def templates_and_densities(points: pd.DataFrame, found: pd.DataFrame) -> Figure:
-    """Plot trigger errors, and the share of particles found in time, for sizes of templates and densities.
+    """Plot trigger errors, and the fraction of particles found in time, for sizes of templates and densities.
 
     Parameters
     ----------
     points : DataFrame
         From `replay.summary`, by `trigger`, `density` and `size`.
     found : DataFrame
-        `density`, `size`, `t_s` and `share`, of measured to true particles.
+        `density`, `size`, `t_s` and `fraction`, of measured to true particles.
 
     Returns
     -------
     Figure
         A row for each trigger with a column for each density: median and quartiles, and as crosses the films
-        that failed; the last row is the share found.
+        that failed; the last row is the fraction found.
     """
     densities, sizes = points["density"].unique(), points["size"].unique()
     figure, axes = panels(len(densities), 10, 6.6, rows=3, sharey="row")
@@ -463,7 +463,7 @@ def templates_and_densities(points: pd.DataFrame, found: pd.DataFrame) -> Figure
             )
             panel.set_xticklabels([f"{s} px" for s in sizes])
         for i, (size, part) in enumerate(found[found["density"] == density].groupby("size", sort=False)):
-            column[2].plot(part["t_s"], part["share"], color=COLOURS[i], ls=LINES[i], label=f"{size} px")
+            column[2].plot(part["t_s"], part["fraction"], color=COLOURS[i], ls=LINES[i], label=f"{size} px")
         column[2].set(xlabel="t (s)", ylim=(0, 1.02))
         column[0].set_title(f"{density:g} particles in view")
     axes[0, 0].set_ylabel(f"error of {TRIGGERS['h']} (s)\n(on top: failed)")
@@ -475,7 +475,7 @@ def templates_and_densities(points: pd.DataFrame, found: pd.DataFrame) -> Figure
 
 @styled
 def replay_view(film: Film, measured: pd.DataFrame, monitor: pd.DataFrame, frame: int) -> Figure:
-    """Show one moment of the replay: the frame, the cross-section, and the two shares up to then.
+    """Show one moment of the replay: the frame, the cross-section, and the two fractions up to then.
 
     Parameters
     ----------
@@ -495,7 +495,7 @@ def replay_view(film: Film, measured: pd.DataFrame, monitor: pd.DataFrame, frame
     true = film.trajectories.positions(frame / film.frame_rate_hz)
     half = channel.height_um / 2
     figure, axes = plt.subplot_mosaic(
-        [["frame", "section"], ["frame", "shares"]], figsize=(10, 5), layout="constrained", width_ratios=[1, 1.05]
+        [["frame", "section"], ["frame", "fractions"]], figsize=(10, 5), layout="constrained", width_ratios=[1, 1.05]
     )
     axes["frame"].imshow(image, **grey(image))
     circles = axes["frame"].scatter(here["x_px"], here["y_px"], s=160, lw=1.8, cmap=DEPTH, c=here["z_um"])
@@ -513,9 +513,9 @@ def replay_view(film: Film, measured: pd.DataFrame, monitor: pd.DataFrame, frame
     )
     figure.colorbar(circles, ax=section, label="z (µm)")
     section.set(xlabel="y (µm)", ylabel="z (µm)", title=f"{len(here)} measured (dots) of {len(true)} (crosses)")
-    _monitor(axes["shares"], monitor[monitor["frame"] <= frame])
-    axes["shares"].set_xlim(0, monitor["t_s"].max())
-    axes["shares"].legend(loc="lower right", fontsize="small", ncols=2)
+    _monitor(axes["fractions"], monitor[monitor["frame"] <= frame])
+    axes["fractions"].set_xlim(0, monitor["t_s"].max())
+    axes["fractions"].legend(loc="lower right", fontsize="small", ncols=2)
     return figure
 
 

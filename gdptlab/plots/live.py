@@ -49,18 +49,18 @@ def live_panel(
     to_channel : callable
         As of `monitor.MiddleThird`.
     level : float
-        Share that triggers.
+        Fraction that triggers.
     seconds : float
         How far the curves go back.
 
     Returns
     -------
     Figure
-        The frame with its particles, coloured by depth; the cross-section with the middle thirds; shares and
+        The frame with its particles, coloured by depth; the cross-section with the middle thirds; fractions and
         triggers (named 'h' and 'w'; thick where on); latencies; and the status in words.
     """
     figure, axes = plt.subplot_mosaic(
-        [["frame", "section", "words"], ["frame", "shares", "late"]],
+        [["frame", "section", "words"], ["frame", "fractions", "late"]],
         figsize=(10.5, 4.4),
         width_ratios=[1.25, 1, 1],
     )
@@ -80,7 +80,7 @@ def live_panel(
             rings.set_edgecolor(rings.to_rgba(here["z_um"]))
             rings.set_facecolor("none")
             axes["section"].scatter(here["y_um"], here["z_um"], c=here["z_um"], s=18, ec="0.3", lw=0.4, **colour)
-    _shares(axes["shares"], recent, level, seconds)
+    _fractions(axes["fractions"], recent, level, seconds)
     _latencies(axes["late"], recent, seconds)
     axes["words"].axis("off")
     axes["words"].text(0, 1, _words(status), va="top", transform=axes["words"].transAxes, **_FONT)
@@ -92,15 +92,15 @@ def _span(recent: pd.DataFrame, seconds: float) -> tuple[float, float]:
     return max(end - seconds, 0), max(end, 1.0)
 
 
-def _shares(axes: Axes, recent: pd.DataFrame, level: float, seconds: float) -> None:
+def _fractions(axes: Axes, recent: pd.DataFrame, level: float, seconds: float) -> None:
     axes.axhline(level, color="black", lw=0.8, ls=":")
     for name, colour in TRIGGER_COLOURS.items():
-        if f"share_{name}" in recent:
-            axes.plot(recent["t_s"], recent[f"share_{name}"], color=colour, lw=1.2, label=f"{name}/3")
-            on = recent[f"share_{name}"].where(recent[f"on_{name}"])
+        if f"fraction_{name}" in recent:
+            axes.plot(recent["t_s"], recent[f"fraction_{name}"], color=colour, lw=1.2, label=f"{name}/3")
+            on = recent[f"fraction_{name}"].where(recent[f"on_{name}"])
             axes.plot(recent["t_s"], on, color=colour, lw=4, solid_capstyle="butt")
             axes.legend(loc="lower right", fontsize="small")
-    axes.set(xlabel="t (s)", ylabel="share (thick: on)", ylim=(0, 1.05), xlim=_span(recent, seconds))
+    axes.set(xlabel="t (s)", ylabel="fraction (thick: on)", ylim=(0, 1.05), xlim=_span(recent, seconds))
 
 
 def _latencies(axes: Axes, recent: pd.DataFrame, seconds: float) -> None:
@@ -168,7 +168,7 @@ def latencies(runs: Mapping[str, pd.DataFrame], limits_ms: Mapping[str, float]) 
     Returns
     -------
     Figure
-        On the left in time, on the right the share of frames that took longer.
+        On the left in time, on the right the fraction of frames that took longer.
     """
     figure, [[line, tail]] = panels(2, 10, 3.2, width_ratios=[1.7, 1], sharey=True)
     for i, (name, recent) in enumerate(runs.items()):
@@ -182,7 +182,7 @@ def latencies(runs: Mapping[str, pd.DataFrame], limits_ms: Mapping[str, float]) 
             panel.axhline(limit, color="0.45", lw=1, ls=":")
         tail.annotate(name, (1, limit), (-2, 2), xycoords=("axes fraction", "data"), textcoords="offset points",
                       ha="right", fontsize="small", color="0.3")  # fmt: skip
-    tail.set(xscale="log", xlabel="share of frames that took longer")
+    tail.set(xscale="log", xlabel="fraction of frames that took longer")
     line.set(xlabel="the frame came at t (s)", ylabel="decided after (ms)", ylim=(0, None))
     figure.legend(*line.get_legend_handles_labels(), loc="outside upper center", ncols=len(runs))
     return figure
@@ -199,15 +199,15 @@ def loop_and_timer(loop: pd.DataFrame, timers: pd.DataFrame, level: float, chose
     timers : DataFrame
         From `device.timed`, of the same films.
     level : float
-        Share that counts as focused.
+        Fraction that counts as focused.
     chosen_s : dict of float
         Settings of the timer to be marked, by name.
 
     Returns
     -------
     Figure
-        Left: one point for each experiment, by its energy density; squares are when the true share reached the
-        level, circles when the monitor switched. Right: against the timer's setting, the share of experiments
+        Left: one point for each experiment, by its energy density; squares are when the true fraction reached the
+        level, circles when the monitor switched. Right: against the timer's setting, the fraction of experiments
         that it stops too early, beside the monitor's.
     """
     figure, [[left, right]] = panels(2, 10, 3.6)
@@ -220,9 +220,9 @@ def loop_and_timer(loop: pd.DataFrame, timers: pd.DataFrame, level: float, chose
         left.plot(ends, [t, t], color=COLOURS[1 + i], ls=LINES[1 + i], label=f"timer, {name}: {t:.2f} s")
     left.set(xlabel="energy density (J/m³)", ylabel="sound off at t (s)", ylim=(0, None))
     left.legend(fontsize="small", loc="lower left")
-    early = (timers["true_share"] < level).groupby(timers["off_s"]).mean()
+    early = (timers["true_fraction"] < level).groupby(timers["off_s"]).mean()
     right.plot(early.index, 100 * early, color=COLOURS[1], label="timer")
-    right.axhline(100 * (loop["true_share"] < level).mean(), color=COLOURS[0], ls=LINES[1], label="monitor")
+    right.axhline(100 * (loop["true_fraction"] < level).mean(), color=COLOURS[0], ls=LINES[1], label="monitor")
     for i, (name, t) in enumerate(chosen_s.items()):
         right.axvline(t, color=COLOURS[1 + i], ls=LINES[1 + i], lw=1)
         right.annotate(name, (t, 111), (2, 0), textcoords="offset points", rotation=90, va="top", fontsize="small")
@@ -239,13 +239,13 @@ def one_loop(recent: pd.DataFrame, true: pd.DataFrame, off_s: float, level: floa
     Parameters
     ----------
     recent : DataFrame
-        Frames looked at: `t_s` since the sound was switched on, and `share`.
+        Frames looked at: `t_s` since the sound was switched on, and `fraction`.
     true : DataFrame
-        From `device.true_shares`.
+        From `device.true_fractions`.
     off_s : float
         When the sound went off.
     level : float
-        Share that triggers.
+        Fraction that triggers.
     of : str
         'h' or 'w'.
 
@@ -257,8 +257,8 @@ def one_loop(recent: pd.DataFrame, true: pd.DataFrame, off_s: float, level: floa
     axes.axvspan(0, off_s, color=TRIGGER_COLOURS[of], alpha=0.1, lw=0)
     axes.axhline(level, color="black", lw=0.8, ls=":")
     axes.plot(true["t_s"], true[f"fraction_{of}"], color=TRIGGER_COLOURS[of], lw=1, ls=LINES[1], label="true")
-    axes.plot(recent["t_s"], recent["share"], "o", color=TRIGGER_COLOURS[of], ms=3, label="measured")
+    axes.plot(recent["t_s"], recent["fraction"], "o", color=TRIGGER_COLOURS[of], ms=3, label="measured")
     axes.annotate(f"sound off at {off_s:.2f} s", (off_s, 0.32), (4, 0), textcoords="offset points")
-    axes.set(xlabel="t (s)", ylabel=f"share of particles in {of}/3", ylim=(0.2, 1.05), xlim=(0, true["t_s"].max()))
+    axes.set(xlabel="t (s)", ylabel=f"fraction of particles in {of}/3", ylim=(0.2, 1.05), xlim=(0, true["t_s"].max()))
     axes.legend(loc="lower right")
     return figure

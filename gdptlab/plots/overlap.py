@@ -161,7 +161,7 @@ def error_ratios(ratios: Mapping[str, pd.DataFrame], reach: float = 6.0) -> Figu
 def film_followed(
     seen: Mapping[str, pd.DataFrame], true: pd.DataFrame, triggers_s: Mapping[str, float], level: float
 ) -> Figure:
-    """Plot how many particles of a film methods find, and the shares that trigger, against time.
+    """Plot how many particles of a film methods find, and the fractions that trigger, against time.
 
     Parameters
     ----------
@@ -172,12 +172,12 @@ def film_followed(
     triggers_s : {'h': float, 'w': float}
         True trigger times.
     level : float
-        Share that triggers.
+        Fraction that triggers.
 
     Returns
     -------
     Figure
-        A triangle is where a measured share first reaches the level.
+        A triangle is where a measured fraction first reaches the level.
     """
     figure, [axes] = panels(3, 11, 3.7, sharey=True)
     for a, symbol in TRIGGERS.items():
@@ -206,7 +206,7 @@ def film_followed(
         panel.axvline(triggers_s[a], color="0.45", lw=1.2, ls=":")
         panel.set(title=f"In the middle third: {symbol}", xlabel="t (s)")
         panel.tick_params(labelleft=True)
-    axes[0].set(xlabel="t (s)", ylabel="share of particles", ylim=(0, 1.05))
+    axes[0].set(xlabel="t (s)", ylabel="fraction of particles", ylim=(0, 1.05))
     axes[0].set_title("Found and right", pad=18)
     handles, labels = axes[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))

@@ -41,8 +41,8 @@ def calibration_page(calibration: Calibration, shown: int = 8) -> Figure:
     -------
     Figure
         The scan where it is sharpest with its beads, numbered as in `calibration.report.beads`; images of the average
-        bead; self-similarity; and against z the signal-to-noise ratio, the expected error, the drift, and how much images
-        differ.
+        bead; self-similarity; and against z the signal-to-noise ratio, the expected error, the drift, and how much
+        images differ.
     """
     made, z_um = calibration.report, calibration.z_um
     if made is None:
@@ -140,7 +140,7 @@ def measured_page(frame: NDArray, table: pd.DataFrame, settings: Settings, calib
     -------
     Figure
         The frame with its particles. Of the correlation, how many are found above each C_m, in frames as they are,
-        in frames with their sign turned, and beside lone particles; of the joint fit, brightness and chi2. And
+        in frames with their sign turned, and beside lone particles; of the joint fit, amplitude and chi2. And
         particles from the surest to the least sure, above the images they are taken for.
     """
     figure = panels(1, 10, 12.4)[0]
@@ -190,10 +190,10 @@ def _cm_histogram(axes: Axes, settings: Settings) -> None:
 
 
 def _even(axes: Axes, table: pd.DataFrame) -> None:
-    axes.plot(table["brightness"], table["chi2"], "o", color=COLOURS[0], ms=4, mew=0, alpha=0.8)
+    axes.plot(table["amplitude"], table["chi2"], "o", color=COLOURS[0], ms=4, mew=0, alpha=0.8)
     axes.axhline(1, color="0.6", lw=1, ls=":")
-    axes.axvline(table["brightness"].median(), color="0.6", lw=1, ls=":")
-    axes.set(xlabel="brightness (1: the calibration's)", ylabel="chi2", title="As bright as each other, and explained")
+    axes.axvline(table["amplitude"].median(), color="0.6", lw=1, ls=":")
+    axes.set(xlabel="amplitude (1: the calibration's)", ylabel="chi2", title="As bright as each other, and explained")
     axes.set_xlim(0, None)
 
 

@@ -119,16 +119,16 @@ def real_time(used: pd.DataFrame, period_s: float, dropped: int) -> Figure:
     Figure
     """
     figure, axes = panels(2, 10, 3.1, width_ratios=[2.6, 1], sharey=True)
-    line, share = axes[0]
+    line, fraction = axes[0]
     late_ms = 1e3 * (used["decision_s"] - used["t_s"])
     line.plot(used["t_s"], late_ms, ".", color=COLOURS[0], ms=5)
-    share.hist(late_ms, bins=30, orientation="horizontal", color=COLOURS[0])
-    for panel in (line, share):
+    fraction.hist(late_ms, bins=30, orientation="horizontal", color=COLOURS[0])
+    for panel in (line, fraction):
         panel.axhline(1e3 * period_s, color=COLOURS[1], ls="--")
     at = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "right"}
     line.annotate("next frame", (1, 1e3 * period_s), (0, 3), color=COLOURS[1], **at)
     line.set(xlabel="the frame arrived at t (s)", ylabel="understood after (ms)")
     line.set_ylim(0, 1.15 * max(late_ms.max(), 1e3 * period_s))
     line.set_title(f"{len(used)} frames evaluated, {dropped} dropped")
-    share.set(xlabel="frames")
+    fraction.set(xlabel="frames")
     return figure

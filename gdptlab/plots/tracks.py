@@ -176,7 +176,7 @@ def links_in_time(scores: Mapping[str, pd.DataFrame]) -> Figure:
     for panel, (column, title) in zip(axes[0], titles.items(), strict=True):
         for k, (name, table) in enumerate(scores.items()):
             panel.plot(table.index, table[column], color=COLOURS[k], marker="os^D"[k], label=name)
-        panel.set(xlabel="t (s)", ylabel="share", title=title)
+        panel.set(xlabel="t (s)", ylabel="fraction", title=title)
     axes[0, 0].legend(fontsize="small", loc="lower left")
     return figure
 

@@ -259,8 +259,8 @@ def link_scores(
         `n_tracks`, `n_links`. Shares of the links: `right`, both ends are the same true particle; `wrong`, they
         are two; `nobody`, an end is none. `found`, right links over those of the truth (from each particle's frame to
         its next), so that missed particles count, too. `n_gaps`, links over one or more frames without a
-        measurement, and `gaps_right`, the share of them. `n_particles`, true ones that are in tracks; `broken`,
-        the share of them that are in more than one; `pieces`, tracks for each. NaN if there are none to divide by.
+        measurement, and `gaps_right`, the fraction of them. `n_particles`, true ones that are in tracks; `broken`,
+        the fraction of them that are in more than one; `pieces`, tracks for each. NaN if there are none to divide by.
 
     Raises
     ------
@@ -282,18 +282,18 @@ def link_scores(
         {
             "n_tracks": tracks["particle"].nunique(),
             "n_links": len(here),
-            "right": _share(right),
-            "wrong": _share(known & ~right),
-            "nobody": _share(~known),
+            "right": _fraction(right),
+            "wrong": _fraction(known & ~right),
+            "nobody": _fraction(~known),
             "found": right.sum() / possible if possible else np.nan,
             "n_gaps": gap.sum(),
-            "gaps_right": _share(right[gap]),
+            "gaps_right": _fraction(right[gap]),
             "n_particles": len(pieces),
-            "broken": _share(pieces > 1),
+            "broken": _fraction(pieces > 1),
             "pieces": pieces.mean(),
         }
     )
 
 
-def _share(yes: NDArray[np.bool_] | pd.Series) -> float:
+def _fraction(yes: NDArray[np.bool_] | pd.Series) -> float:
     return float(np.mean(yes)) if len(yes) else np.nan
