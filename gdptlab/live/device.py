@@ -317,8 +317,8 @@ def closed_loop(
     -------
     dict
         `seed`, `energy_density_J_m3`; `needed_s`, when the true fraction reached the level (NaN: never); `off_s`, when
-        the sound was switched off, and `true_fraction` then; `exposed_s` and `delivered_s`, the two times of the frame that
-        did it, and `fraction`, what was measured in it: all NaN if it never was; `delay_ms` from its delivery and
+        the sound was switched off, and `true_fraction` then; `exposed_s` and `delivered_s`, the two times of the frame
+        that did it, and `fraction`, what was measured in it: all NaN if it never was; `delay_ms` from its delivery and
         `exposure_delay_ms` from its exposure until the sound was off; `frames` that the camera delivered until the
         end, and `dropped`.
     """
