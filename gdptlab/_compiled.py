@@ -9,7 +9,7 @@ from gdptlab._files import sources_folder
 
 
 def compiled(function: Callable) -> Callable:
-    """Compile a function of arrays and numbers to machine code at its first call, and keep the code on disk (decorator).
+    """Decorator: compile a function of arrays and numbers to machine code at its first call, and keep it on disk.
 
     numba knows a kept function by the file that it stands in, but not by the `inlined` functions of other files that
     became parts of it. So the folder of the machine code changes with any source of the package. Where no folder can
