@@ -6,12 +6,16 @@ import hashlib
 import os
 import shutil
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from uuid import uuid4
+from zipfile import BadZipFile
 
+import numpy as np
+from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
 UNUSED_DAYS = 30.0
@@ -115,3 +119,12 @@ def sources_folder(name: str) -> Path | None:
         if other != folder and time.time() - other.stat().st_mtime > UNUSED_DAYS * 86400:
             shutil.rmtree(other, ignore_errors=True)
     return folder
+
+
+def kept_arrays(path: Path) -> dict[str, NDArray] | None:
+    """Return the arrays in an .npz file of the cache by name, or None if the file is missing or damaged."""
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, BadZipFile, zlib.error):
+        return None

@@ -14,12 +14,9 @@ Any function with the signature of `locate` can be the evaluator.
 import inspect
 import sys
 import time
-import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import joblib
 import numpy as np
@@ -29,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from gdptlab._checks import positive, whole
-from gdptlab._files import sources_folder, written_whole
+from gdptlab._files import kept_arrays, sources_folder, written_whole
 from gdptlab._versions import versions
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
@@ -171,10 +168,11 @@ def evaluate(
     frames = evaluated_frames(film, every)
     folder = sources_folder("replay") if cache else None
     paths = [folder / _cache_name(film, method, frames) if folder else None for method in methods]
-    tables = [_load(path) if path else None for path in paths]
+    # `joblib.Memory` would keep the result of one call; here one pass over the film serves all missing tables.
+    tables = [kept_arrays(path) if path else None for path in paths]
     missing = [i for i, table in enumerate(tables) if table is None]
     if not missing:
-        return tables
+        return [pd.DataFrame(table) for table in tables]
     todo = [methods[i] for i in missing]
     # This process evaluates the first frame, so that workers get calibrations whose lazy parts are there already.
     parts = [_evaluated(film, todo, frames[:1])]
@@ -185,12 +183,11 @@ def evaluate(
             parts.append(part)
             bar.update(len(block))
     for i, *pieces in zip(missing, *parts, strict=True):
-        columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+        tables[i] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
         if paths[i]:
             with written_whole(paths[i]) as temporary:
-                np.savez_compressed(temporary, **columns)
-        tables[i] = pd.DataFrame(columns)
-    return tables
+                np.savez_compressed(temporary, **tables[i])
+    return [pd.DataFrame(table) for table in tables]
 
 
 def evaluated_frames(film: Film, every: int = 1) -> NDArray[np.int64]:
@@ -210,19 +207,6 @@ def _evaluated(film: Film, methods: Sequence[Method], frames: NDArray[np.int64])
         | {name: np.concatenate([t[name].to_numpy() for t in tables]) for name in tables[0] if name != "frame"}
         for tables in found
     ]
-
-
-def _load(path: Path) -> pd.DataFrame | None:
-    """Return a kept table, or None if there is none or its file is damaged.
-
-    `joblib.Memory` would keep what one call returns, but here one pass over the film serves all the methods whose
-    tables are missing; and it would take more lines than these and `np.savez_compressed`.
-    """
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return pd.DataFrame({name: file[name] for name in file.files})
-    except (OSError, ValueError, EOFError, BadZipFile, zlib.error):
-        return None
 
 
 def _cache_name(film: Film, method: Method, frames: NDArray[np.int64]) -> str:
