@@ -1,11 +1,12 @@
 """Tables that guard a rebuild: what the package measured when they were stored (`test_stored_results.py` compares).
 
-``python tests/stored_results.py`` stores them anew: only for a change that is meant to alter a number, in a commit of
-its own that says why. Beside the tables, ``made_on.json`` names the versions and the processor that made them.
+``python tests/stored_results.py [NAME ...]`` stores all, or these, anew: only for a change that is meant to alter a
+number, in a commit of its own that says why. Beside the tables, ``made_on.json`` names the versions and the processor that made them.
 """
 
 import json
 import platform
+import sys
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -110,10 +111,10 @@ def made_here() -> dict[str, str]:
 
 
 def main() -> None:
-    """Store all tables."""
+    """Store the tables that are named, or all."""
     STORED.mkdir(exist_ok=True)
-    for name, compute in TABLES.items():
-        compute().to_csv(STORED / f"{name}.csv", index=False, float_format="%.10g")
+    for name in sys.argv[1:] or TABLES:
+        TABLES[name]().to_csv(STORED / f"{name}.csv", index=False, float_format="%.10g")
         print(name, flush=True)
     (STORED / "made_on.json").write_text(json.dumps(made_here(), indent=1) + "\n")
 
