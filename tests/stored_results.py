@@ -1,7 +1,8 @@
 """Tables that guard a rebuild: what the package measured when they were stored (`test_stored_results.py` compares).
 
 ``python tests/stored_results.py [NAME ...]`` stores all, or these, anew: only for a change that is meant to alter a
-number, in a commit of its own that says why. Beside the tables, ``made_on.json`` names the versions and the processor that made them.
+number, in a commit of its own that says why. Beside the tables, ``made_on.json`` names the versions and the processor
+that made them.
 """
 
 import json
