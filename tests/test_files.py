@@ -60,7 +60,7 @@ def test_cache_folder_is_the_one_of_the_environment(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("value", [None, ""])
 def test_cache_folder_without_environment_is_the_users(tmp_path, monkeypatch, value):
-    monkeypatch.setattr("gdptlab.files.user_cache_path", lambda name, appauthor: tmp_path / name)
+    monkeypatch.setattr("gdptlab._files.user_cache_path", lambda name, appauthor: tmp_path / name)
     monkeypatch.delenv("GDPTLAB_CACHE", raising=False)
     if value is not None:
         monkeypatch.setenv("GDPTLAB_CACHE", value)

@@ -31,10 +31,9 @@ def frame_times(times: pd.DataFrame, floors: Mapping[str, pd.Series] | None = No
     -------
     Figure
     """
-    panels, methods = times["varied"].unique(), times["method"].unique()
-    figure, axes = panels(len(panels), 3.1 * len(panels), 3.6, sharey=True)
-    axes = axes[0]
-    for panel, varied in zip(axes, panels, strict=True):
+    columns, methods = times["varied"].unique(), times["method"].unique()
+    figure, [axes] = panels(len(columns), 3.1 * len(columns), 3.6, sharey=True)
+    for panel, varied in zip(axes, columns, strict=True):
         here = times[times["varied"] == varied]
         for i, method in enumerate(methods):
             line = here[here["method"] == method].sort_values("value")
