@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 from scipy.spatial import KDTree
 
-from gdptlab import Calibration, assessment, find_beads, locate
+from gdptlab import Calibration, assessment, locate
 from gdptlab.experiment import Camera, Microscope
-from gdptlab.pipeline.quality import depth_quality, report
+from gdptlab.pipeline import depth_quality, find_beads, report
 
 Z_UM = np.linspace(-50, 50, 26)
 PLACES = np.array([[60.3, 55.8], [180.2, 60.4], [300.7, 52.1], [58.0, 170.9], [182.6, 176.3], [205.0, 190.0]])
