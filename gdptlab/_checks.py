@@ -14,8 +14,8 @@ LARGEST = 1e12
 numbers, an image, is 1e38, which float32 still holds; ten times more would be infinity."""
 
 RESOLVED = 1e-4
-"""Largest spacing of float32 numbers, as a fraction of an image's contrast, at which `image_array` leaves the offset in.
-Derived: rounding adds noise of 0.3 spacings, 3e-5 of the contrast, a tenth of the read noise of a 12-bit camera."""
+"""Largest spacing of float32 numbers, as a fraction of the contrast, at which `image_array` leaves the offset in.
+Derived: rounding to it adds noise of 0.3 spacings (1 / sqrt(12)), 3e-5 of the contrast."""
 
 
 def number(name: str, value: Any) -> float:
@@ -179,7 +179,7 @@ def image_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
 
 
 def _refuse_masked(name: str, value: Any) -> None:
-    """Refuse an array with masked entries, or a list with such an array in it: numpy would use what is under the mask."""
+    """Refuse an array with masked entries, or a list with one in it: numpy would use what is under the mask."""
     parts = [value, *value] if isinstance(value, list | tuple) else [value]
     if any(np.ma.is_masked(part) for part in parts):
         raise ValueError(f"{name}: got masked entries, allowed is an array without (see numpy.ma.filled)")

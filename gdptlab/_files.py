@@ -44,10 +44,12 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     ['z.csv']
     """
     path = Path(path)
+    if path.is_symlink():  # the file it leads to is written, and the link stays
+        path = path.resolve()
     if not path.parent.is_dir():
         raise FileNotFoundError(f"path must lie in a folder that exists, got {str(path)!r}")
-    # Unique, so that two processes filling one cache do not write into each other's file.
-    temporary = path.with_name(f".{path.stem}-{uuid4().hex}.part{path.suffix}")
+    # Unique, so that two processes filling one cache do not write into each other's file; short, for names have limits.
+    temporary = path.with_name(f".{uuid4().hex}.part{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
@@ -57,6 +59,6 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 def cache_folder() -> Path:
     """Folder for what can be computed again: GDPTLAB_CACHE of the environment, or else the user's cache."""
-    folder = Path(os.environ.get("GDPTLAB_CACHE") or user_cache_path("gdptlab", appauthor=False))
+    folder = Path(os.environ.get("GDPTLAB_CACHE") or user_cache_path("gdptlab", appauthor=False)).expanduser()
     folder.mkdir(parents=True, exist_ok=True)
     return folder
