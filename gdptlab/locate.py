@@ -295,7 +295,7 @@ def in_blocks(
 
 def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:
     """Number of the first frame, and frames, of each block not in `done`, to be handed to a process."""
-    if hasattr(frames, "shape"):  # arrays of numpy, dask and zarr, and `Images`: nothing is read yet
+    if len(getattr(frames, "shape", ())) == 3:  # arrays of numpy, dask and zarr, and `Images`: nothing is read yet
         blocks = (frames[first : first + BLOCK] for first in range(0, len(frames), BLOCK))
     else:
         copies = _copies(frames)

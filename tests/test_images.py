@@ -340,7 +340,7 @@ def test_a_channel_of_imagej_is_chosen(tmp_path):
         tmp_path / "a.tif", FILM.reshape(6, 2, 9, 14), imagej=True, photometric=None, metadata={"axes": "TCYX"}
     )
     assert_holds(open_images(path, channel=0), FILM[::2])
-    scan, z_um = open_scan(path, start_um=5, step_um=-1, channel=0)
+    scan, _ = open_scan(path, start_um=5, step_um=-1, channel=0)
     assert_holds(scan, FILM[::2][::-1])
     with pytest.raises(ValueError, match=r"^path: got 'a.tif'"):
         open_images(path)
