@@ -19,6 +19,7 @@ frame's edge.
 """
 
 from collections.abc import Container, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import count, islice
 
 import cv2
@@ -28,7 +29,7 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from gdptlab._checks import choice, flag, positive, real_array, whole
+from gdptlab._checks import choice, flag, image_array, positive, whole
 from gdptlab._compiled import on_one_core
 from gdptlab.calibration import Calibration, checked
 from gdptlab.correlation import peaks, standardised, strongest, vertex
@@ -138,7 +139,7 @@ def checked_frame(
 def checked_image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
     """Check that an image (rows, columns) holds at least a template; the image as float32."""
     size = checked(calibration).size
-    image = real_array("image", image, 2)
+    image = image_array("image", image, 2)
     if min(image.shape) < size:
         raise ValueError(f"image: got shape {image.shape}, allowed is no smaller than a template, {(size, size)}")
     return image
@@ -279,15 +280,19 @@ def in_blocks(
         before = None
         for first, block in _blocks(frames, ()):
             tables = []
-            for frame in block:
-                table, before = explained(frame, calibration, before)
+            for k, frame in enumerate(block, first):
+                with _numbered_error(k):
+                    table, before = explained(frame, calibration, before)
                 tables.append(table)
             if first not in done:
                 yield first, len(tables), _numbered(tables, first)
         return
     jobs = (delayed(_located)(block, first, calibration, settings) for first, block in _blocks(frames, done))
     # What joblib puts into shared memory stays there until the last frame: of a long film too much.
-    yield from Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1", max_nbytes=None)(jobs)
+    for first, n, table in Parallel(n_jobs, return_as="generator", pre_dispatch="n_jobs + 1", max_nbytes=None)(jobs):
+        if isinstance(table, Exception):
+            raise table
+        yield first, n, table
 
 
 def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:
@@ -295,7 +300,7 @@ def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple
     if len(getattr(frames, "shape", ())) == 3:  # arrays of numpy, dask and zarr, and `Images`: nothing is read yet
         blocks = (frames[first : first + BLOCK] for first in range(0, len(frames), BLOCK))
     else:
-        copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
+        copies = _copies(frames)
         blocks = iter(lambda: list(islice(copies, BLOCK)), [])
     for first, block in zip(count(0, BLOCK), blocks, strict=False):
         if first not in done:
@@ -305,12 +310,42 @@ def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple
             yield first, list(block.copy()) if isinstance(block, np.ndarray) else block
 
 
+def _copies(frames: Iterable[ArrayLike]) -> Iterator[NDArray]:
+    """Copies of frames (rows, columns), for a camera may show every frame in the same piece of memory."""
+    shape = None
+    for k, frame in enumerate(frames):
+        copy = np.ma.array(frame) if np.ma.is_masked(frame) else np.array(frame)
+        shape = shape or copy.shape
+        if copy.shape != shape:
+            raise ValueError(f"frames: got shape {copy.shape} in frame {k}, allowed is that of frame 0, {shape}")
+        yield copy
+
+
 def _located(
     block: Iterable[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
-) -> tuple[int, int, pd.DataFrame]:
-    """Number of the first frame of a block, how many there are, and what is in them."""
-    tables = [locate(frame, calibration, **settings) for frame in block]
+) -> tuple[int, int, pd.DataFrame | Exception]:
+    """Number of the first frame of a block, how many there are, and what is in them, or the error of one.
+
+    An error that is raised in another process would stop the blocks before it, too, and they would be lost.
+    """
+    tables = []
+    try:
+        for k, frame in enumerate(block, first):
+            with _numbered_error(k):
+                tables.append(locate(frame, calibration, **settings))
+    except Exception as error:
+        return first, len(tables), error
     return first, len(tables), _numbered(tables, first)
+
+
+@contextmanager
+def _numbered_error(frame: int) -> Iterator[None]:
+    """Add the number of the frame to an error about it."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        kind = ValueError if isinstance(error, ValueError) else TypeError
+        raise kind(f"{error} (frame {frame})") from error
 
 
 def _numbered(tables: list[pd.DataFrame], first: int) -> pd.DataFrame:

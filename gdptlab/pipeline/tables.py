@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from gdptlab import _checks as check
-from gdptlab._files import written_whole
+from gdptlab._files import sources_digest, written_whole
 from gdptlab._versions import versions
 from gdptlab.calibration import Calibration, checked
 from gdptlab.locate import THRESHOLD, locate
@@ -61,7 +61,12 @@ def about(calibration: Calibration, settings: dict[str, object]) -> dict[str, ob
     settings = unsaid | settings
     if settings["method"] == "correlation" and settings["threshold"] is None:
         settings["threshold"] = THRESHOLD
-    return {"calibration": fingerprint(calibration), "settings": settings, "versions": versions()}
+    return {
+        "calibration": fingerprint(calibration),
+        "settings": settings,
+        "sources": sources_digest(),
+        "versions": versions(),
+    }
 
 
 def as_json(note: dict[str, object]) -> str:
