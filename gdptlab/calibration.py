@@ -5,6 +5,7 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 """
 
 import os
+import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import uniform_filter1d
 
-from gdptlab._checks import depths, flag, positive, real_array, whole
+from gdptlab._checks import depths, flag, image_array, positive, whole
 from gdptlab._compiled import on_one_core
 from gdptlab._files import written_whole
 from gdptlab._plans import planned
@@ -27,6 +28,9 @@ from gdptlab.refinement import Displacement
 
 VERSION = 1
 """Of the file format of `Calibration.save`."""
+
+PARTS = {"stack": 3, "z_um": 1, "subset": 1, "templates": 3}
+"""Arrays in the file of `Calibration.save`, and how many axes each has."""
 
 REPEATS = 4
 """Of making the calibration again, to see what noise does to it."""
@@ -93,7 +97,7 @@ class Calibration:
             If the stack or z_um are not of that form, hold NaN, or an image is constant; if n or n_sub is out
             of range.
         """
-        stack, z_um = real_array("stack", stack, 3), depths("z_um", z_um)
+        stack, z_um = image_array("stack", stack, 3), depths("z_um", z_um)
         if stack.shape[1] != stack.shape[2] or stack.shape[1] % 2 == 0:
             raise ValueError(f"stack: got images of {stack.shape[1:]} px, allowed are square ones of odd size")
         if len(stack) < 3:
@@ -418,22 +422,57 @@ class Calibration:
         ValueError
             If it is damaged, of another version, or no calibration.
         """
+        name = Path(path).name
         try:
-            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-                data = {name: file[name] for name in file.files}
+            with zipfile.ZipFile(path) as archive:
+                shapes = {part.removesuffix(".npy"): _shape(archive, part) for part in archive.namelist()}
+                _must_fit(shapes, {part.filename: part.file_size for part in archive.infolist()})
+            with np.load(path, allow_pickle=False) as file:
+                version = file["gdptlab_calibration"]
+                if not np.array_equal(version, VERSION):
+                    raise ValueError(f"it is of version {version}, allowed is version {VERSION}")
+                data = {part: file[part] for part in PARTS}
+            _must_be_sound(data)
         except FileNotFoundError:
             raise
         except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ValueError(
-                f"path: got {Path(path).name!r}, which cannot be read as a calibration: {error}"
-            ) from error
-        version = data.pop("gdptlab_calibration", None)
-        name = Path(path).name
-        if not np.array_equal(version, VERSION) or set(data) != {"stack", "z_um", "subset", "templates"}:
-            raise ValueError(f"path: got {name!r} of version {version}, allowed are calibrations of version {VERSION}")
-        if not len(data["stack"]) == len(data["z_um"]) == len(data["templates"]) > data["subset"].max():
-            raise ValueError(f"path: got {name!r}, whose parts do not fit each other")
+            raise ValueError(f"path: got {name!r}, which cannot be read as a calibration: {error}") from error
         return cls(**data)
+
+
+def _shape(archive: zipfile.ZipFile, part: str) -> tuple[int, ...]:
+    """Shape of an array in a file of numpy's, from its header alone."""
+    with archive.open(part) as opened:
+        major = np.lib.format.read_magic(opened)[0]
+        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        return read(opened)[0]
+
+
+def _must_fit(shapes: dict[str, tuple[int, ...]], sizes: dict[str, int]) -> None:
+    """Raise ValueError unless the arrays of a file, by their shapes, are those of a calibration and fit each other."""
+    if set(shapes) != {"gdptlab_calibration", *PARTS}:
+        raise ValueError(f"it holds {', '.join(shapes)}, needed are gdptlab_calibration, {', '.join(PARTS)}")
+    stack, images = shapes["stack"], len(shapes["z_um"]) and shapes["z_um"][0]
+    square = len(stack) == 3 and stack[0] == images >= 3 and stack[1] == stack[2] and stack[1] % 2 == 1
+    subset = len(shapes["subset"]) == 1 and 2 <= shapes["subset"][0] <= images
+    if not (square and subset and len(shapes["z_um"]) == 1 and shapes["templates"] == stack):
+        raise ValueError(f"its arrays have shapes that do not fit each other: {shapes}")
+    if max(sizes.values()) > 16 * np.prod(stack) + 1000:
+        raise ValueError(f"its arrays have more bytes than shapes: {sizes}")
+
+
+def _must_be_sound(data: dict[str, NDArray]) -> None:
+    """Raise ValueError unless arrays that fit each other are what `from_stack` would make of them."""
+    for part in PARTS:
+        if data[part].dtype.kind != ("i" if part == "subset" else "f") or not np.isfinite(data[part]).all():
+            raise ValueError(f"{part} holds what is not finite or not of its type, {data[part].dtype}")
+    if not (np.diff(data["z_um"]) > 0).all():
+        raise ValueError("z_um does not increase")
+    subset = data["subset"]
+    if subset.min() < 0 or subset.max() >= len(data["stack"]) or not (np.diff(subset) > 0).all():
+        raise ValueError(f"subset does not name images in increasing order: {subset}")
+    if np.abs(np.linalg.norm(data["templates"], axis=(1, 2)) - 1).max() > 1e-3:
+        raise ValueError("templates do not have norm 1")
 
 
 def _correlator(calibration: Calibration, shape: tuple[int, int]) -> Correlator:

@@ -74,8 +74,8 @@ def tracked() -> pd.DataFrame:
     """Velocities of the particles of a film."""
     frames = film()
     table = batch(list(frames), sample_calibration("fluorescent"), method="joint", progress=False)
-    tracks = link(frames.to_channel(table), frames.trajectories.focusing.channel, frames.frame_rate_hz)
-    return velocities(tracks, frames.frame_rate_hz)
+    channel, rate = frames.trajectories.focusing.channel, frames.frame_rate_hz
+    return velocities(link(frames.to_channel(table), predictor=channel, frame_rate_hz=rate), rate)
 
 
 def beads_correlation() -> pd.DataFrame:
