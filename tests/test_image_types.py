@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdptlab.experiment import Camera
-from gdptlab.experiment.image_types import IMAGE_TYPES, as_image_type, brightfield, disturbed, fluorescent
+from gdptlab.experiment.image_types import IMAGE_TYPES, WHITE, as_image_type, brightfield, disturbed, fluorescent
 
 LIGHT = np.random.default_rng(3).uniform(0, 4000, (30, 47)).astype(np.float32)
 
@@ -25,6 +25,13 @@ def test_any_real_type_of_image(image_type, dtype):
     np.testing.assert_allclose(image_type(whole.astype(dtype)), image_type(whole), rtol=1e-5, atol=1e-2)
     if dtype == np.float32:
         assert image_type(whole).dtype == np.float32
+
+
+def test_the_disturbance_can_be_seen():
+    """Its amplitude is 2 to 5 % of the empty field, as the illumination of a real condenser varies."""
+    field = disturbed(np.zeros((600, 600), np.float32))
+    amplitude = (field.max() - field.min()) / 2
+    assert 0.02 <= round(amplitude / WHITE, 4) <= 0.05
 
 
 def test_type_by_name_or_function():
