@@ -10,6 +10,7 @@ Depths are in µm, z = 0 at the middle of the measured volume, larger z farther 
 
 import hashlib
 import os
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from scipy.stats import qmc
 
 from gdptlab._checks import number, positive, whole
 from gdptlab._compiled import on_one_core
-from gdptlab._files import cache_folder, kept_arrays, written_whole
+from gdptlab._files import cache_folder, keep_arrays, kept_arrays
 from gdptlab.experiment.camera import Camera
 from gdptlab.experiment.image_types import as_image_type
 
@@ -440,11 +441,11 @@ def _library(microscope: Microscope, diameter_um: float) -> Library:
     z_um, fine = _traced_library(microscope, diameter_um)
     fine = fine.astype(np.float16)
     if path:
-        with written_whole(path) as temporary:
-            np.savez_compressed(temporary, z_um=z_um, fine=fine)
-        files = sorted(folder.glob("particle-images-*.npz"), key=lambda file: file.stat().st_mtime)
-        for unused in files[:-LIBRARIES_ON_DISK]:
-            unused.unlink(missing_ok=True)
+        keep_arrays(path, {"z_um": z_um, "fine": fine})
+        with suppress(OSError):  # another process may remove the same files
+            files = sorted(folder.glob("particle-images-*.npz"), key=lambda file: file.stat().st_mtime)
+            for unused in files[:-LIBRARIES_ON_DISK]:
+                unused.unlink()
     return Library(z_um, fine.astype(np.float32))
 
 
