@@ -45,9 +45,10 @@ linearly. Chosen at four depths from -35 to 0 µm, half-way between two diameter
 traced directly, over the RMS of that image, rises from 0.8-0.9 % (the noise of 2^20 rays alone) to 0.8-1.0 % with
 1.1, 1.6-2.5 % with 1.2 and 2.6-4.7 % with 1.3. Nearer to 1, more diameters are traced, each for some 10 s."""
 
-LIBRARIES_IN_MEMORY = 8
-"""Number of traced libraries that stay in memory, some 90 MB each. Chosen: diameters that differ by 10 % (standard
-deviation) need 6 to 8. With fewer, each frame reads libraries again, for some 2 s each."""
+LIBRARIES_IN_MEMORY = 10
+"""Number of traced libraries that stay in memory, some 90 MB each. Chosen: a frame of 50 particles whose diameters
+differ by 10 % (standard deviation) needs 6 to 9 (20 draws). With fewer, each frame reads libraries from the disk again,
+some seconds each; with more, rare diameters hold memory."""
 
 LIBRARIES_ON_DISK = 16
 """Number of traced libraries that stay in the cache folder, 24 MB each; those unused for longest are removed. Chosen:
