@@ -191,7 +191,7 @@ def test_bad_arguments_of_export(tmp_path, call, error, name):
 
 def test_velocity_field_of_a_vortex():
     """From positions to a field, without a channel: the solid-body rotation comes back."""
-    rng, rate, turn = np.random.default_rng(7), 30.0, 2.0  # rad/s
+    rng, rate, turn = np.random.default_rng(7), 60.0, 2.0  # rad/s
     radius, phase = 80 * np.sqrt(rng.random(150)), rng.uniform(0, 2 * np.pi, 150)
     frames = []
     for k in range(25):
