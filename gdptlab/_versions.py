@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import re
-from functools import cache
 from importlib import metadata
-from pathlib import Path
 
 __all__ = ["versions"]
 
@@ -44,12 +41,3 @@ def versions() -> dict[str, str]:
         requirements = []
     names = [re.match(r"[\w.-]+", requirement)[0] for requirement in requirements]
     return found | {name: _version(name) for name in names}
-
-
-@cache
-def source_hash() -> str:
-    """Hexadecimal SHA-256 of all sources of the package: what it computes may change with any of them."""
-    folder, digest = Path(__file__).parent, hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()

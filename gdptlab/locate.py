@@ -1,20 +1,21 @@
-"""From a frame to a table of particles, without segmentation.
+"""From a frame, or a film, to a table of particles, without segmentation.
 
 By correlation (the paper's section 2):
 
 1. The frame is correlated with the N_sub images of the calibration's subset (Figure 2b).
-2. Candidates are local peaks, in any of the maps, above a threshold.
-3. A candidate's profile is the highest C_m in each map within two pixels of the peak (Figure 2c), at the top of
-   parabolas through the neighbouring pixels: peaks lie between pixels, and those of different maps a pixel apart.
-4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, which is blind
-   to the noise that lowers the whole profile; a parabola through the best three gives the part of a step.
-5. Refinement: the candidate's window is correlated with stack images from the guess onward, uphill along z
-   until C_m no longer rises. Between pixels and images, x, y and z are the least-squares displacement of the
-   best image within that window.
+2. Candidates are the local maxima above a threshold in any of the maps.
+3. The profile of a candidate is the highest C_m of each map within two pixels of the maximum (Figure 2c), taken at the
+   vertex of parabolas through the neighbouring pixels: peaks lie between pixels, those of different maps a pixel apart.
+4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, since noise lowers
+   the whole profile and Pearson's correlation does not depend on its level. A parabola through the best three gives z
+   between slices.
+5. Refinement: the window of the candidate is correlated with templates from the guess onward, uphill along z until C_m
+   no longer rises. Between pixels and slices, x, y and z follow from least squares in that window (`refinement`).
 6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
 
-A particle is then measured only if its whole window lies in the frame; nothing is said of a border half a
-template wide. Or jointly (`overlap`): particles may overlap and be cut by the frame's edge.
+A particle is measured only if its whole window lies in the frame, so that a border half a template wide stays empty.
+With ``method="joint"`` all particles of a frame are fitted at once (`gdptlab.fit`): they may overlap and be cut by the
+frame's edge.
 """
 
 from collections.abc import Container, Iterable, Iterator
@@ -34,16 +35,17 @@ from gdptlab.calibration import Calibration, checked
 from gdptlab.correlation import peaks, standardised, strongest, vertex
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
-"""Columns of the table that `locate` returns, and their types."""
+"""Columns of the table that `locate` returns by correlation, and their types."""
 
 THRESHOLD = 0.5
 """Lowest C_m of a particle, if none is given (the paper, section 2: normally 0.5)."""
 
 METHODS = ("correlation", "joint")
-"""How `locate` can work."""
+"""Methods of `locate`."""
 
 BLOCK = 25
-"""Consecutive frames that `batch` hands to a process: long against what it costs to hand them over."""
+"""Number of consecutive frames that `batch` hands to a process at a time. Chosen: measuring them takes some hundred
+times as long as handing them over."""
 
 
 @on_one_core
@@ -61,18 +63,18 @@ def locate(
     Parameters
     ----------
     image : array (rows, columns)
-        Any real type, no smaller than a template.
+        Any real type; no smaller than a template.
     calibration : Calibration
     method : str
-        "correlation", or "joint": all particles fitted at once, for those that overlap. That is slower, and
-        it takes the particles to be about equally bright. It finds its own threshold, from the noise.
+        "correlation", or "joint": all particles are fitted at once, for particles that overlap. The joint fit is
+        slower, and its threshold follows from the noise.
     threshold : float, optional
         Lowest C_m of a particle, above 0, at most 1; `THRESHOLD` if not given. Like the next two, it belongs to
         "correlation" and is refused with "joint".
     refine : bool
-        Walk along the whole stack to the best C_m. Without it, z comes from the subset's profile alone.
+        Walk along the whole stack to the best C_m. Without refinement, z comes from the subset's profile alone.
     min_distance_px : float, optional
-        Nearest that two particles can be told apart; a quarter of a template if not given.
+        Smallest distance of two particles; a quarter of a template if not given.
 
     Returns
     -------
@@ -109,22 +111,22 @@ def locate(
         return explained(image, calibration)[0]
     threshold = THRESHOLD if threshold is None else threshold
     image, distance = checked_frame(image, calibration, threshold, min_distance_px)
-    place, step, cm = _candidates(image, calibration, threshold)
+    position, slice_, cm = _candidates(image, calibration, threshold)
     if flag("refine", refine):
-        place, step, cm = _refined(image, calibration, place, step)
-    kept = strongest(place, np.where(cm >= threshold, cm, 0), distance)
-    place, step, cm = place[kept], step[kept], cm[kept]
+        position, slice_, cm = _refined(image, calibration, position, slice_)
+    kept = strongest(position, np.where(cm >= threshold, cm, 0), distance)
+    position, slice_, cm = position[kept], slice_[kept], cm[kept]
     if not refine:
-        first = _pixels(image, calibration, place)
-        shift = calibration.displacement(image, first, np.rint(step))
-        place = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
-    return as_table(place, step, cm, calibration.z_um)
+        first = _pixels(image, calibration, position)
+        shift = calibration.displacement(image, first, np.rint(slice_))
+        position = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
+    return as_table(position, slice_, cm, calibration.z_um)
 
 
 def checked_frame(
     image: ArrayLike, calibration: Calibration, threshold: float, min_distance_px: float | None
 ) -> tuple[NDArray[np.float32], float]:
-    """Image, less its mean, and distance in px, if all four are what `locate` takes."""
+    """Check the arguments of `locate`; the image (rows, columns) less its mean, and the distance in px."""
     image = checked_image(image, calibration)
     if not 0 < positive("threshold", threshold) <= 1:
         raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
@@ -135,7 +137,7 @@ def checked_frame(
 
 
 def checked_image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
-    """Image, if it is one that holds at least a template."""
+    """Check that an image (rows, columns) holds at least a template; the image as float32."""
     size = checked(calibration).size
     image = image_array("image", image, 2)
     if min(image.shape) < size:
@@ -143,16 +145,16 @@ def checked_image(image: ArrayLike, calibration: Calibration) -> NDArray[np.floa
     return image
 
 
-def as_table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.DataFrame:
-    """What `locate` returns, of places (y, x) (n, 2), z in steps of the stack, C_m, and the depths of the steps."""
+def as_table(position: NDArray, slice_: NDArray, cm: NDArray, z_um: NDArray) -> pd.DataFrame:
+    """Table of `locate`, from positions (y, x) (n, 2), z in slices (n,), C_m (n,) and the depths of the slices (N,)."""
     last = len(z_um) - 1
     return pd.DataFrame(
         {
-            "x_px": place[:, 1].astype(float),
-            "y_px": place[:, 0].astype(float),
-            "z_um": np.interp(step, np.arange(last + 1), z_um),
+            "x_px": position[:, 1].astype(float),
+            "y_px": position[:, 0].astype(float),
+            "z_um": np.interp(slice_, np.arange(last + 1), z_um),
             "cm": np.minimum(cm, 1).astype(float),
-            "at_end": (step <= 0) | (step >= last),
+            "at_end": (slice_ <= 0) | (slice_ >= last),
         }
     )
 
@@ -160,30 +162,30 @@ def as_table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.Da
 def _candidates(
     image: NDArray[np.float32], calibration: Calibration, threshold: float
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Peaks of the correlation maps: place (y, x) (n, 2), z in steps of the stack, C_m."""
+    """Peaks of the correlation maps: positions (y, x) (n, 2), z in slices (n,), C_m (n,)."""
     scale, near = (2, 1) if calibration.half_resolution else (1, 2)
     searched = cv2.pyrDown(image) if scale == 2 else image
     maps = calibration.correlator(searched.shape)(searched)
-    place, cm, profile = peaks(maps, threshold, near)
-    likeness = standardised(profile) @ standardised(calibration.expected).T
-    k = np.clip(likeness.argmax(axis=1), 1, len(calibration) - 2)
-    step = k + vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
+    position, cm, profile = peaks(maps, threshold, near)
+    agreement = standardised(profile) @ standardised(calibration.expected).T
+    k = np.clip(agreement.argmax(axis=1), 1, len(calibration) - 2)
+    slice_ = k + vertex(agreement[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
     middle = calibration.search_templates.shape[-1] // 2
-    return scale * (place + middle), step, cm
+    return scale * (position + middle), slice_, cm
 
 
-def _pixels(image: NDArray[np.float32], calibration: Calibration, place: NDArray) -> NDArray[np.int64]:
-    """First pixels (n, 2) of the windows around `place` (n, 2), the nearest that lie in the image."""
-    first = np.rint(place - calibration.size // 2).astype(int)
+def _pixels(image: NDArray[np.float32], calibration: Calibration, position: NDArray) -> NDArray[np.int64]:
+    """First pixels (n, 2) of the windows nearest to `position` (n, 2) that lie in the image."""
+    first = np.rint(position - calibration.size // 2).astype(int)
     return np.clip(first, 0, np.array(image.shape) - calibration.size)
 
 
 def _refined(
-    image: NDArray[np.float32], calibration: Calibration, place: NDArray, step: NDArray
+    image: NDArray[np.float32], calibration: Calibration, position: NDArray, slice_: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Walk every candidate along the stack and across the pixels to its best C_m (0 if it leaves the frame)."""
+    """Walk every candidate along the stack and across the pixels to its best C_m (0 if the walk leaves the frame)."""
     last = len(calibration) - 1
-    start = _pixels(image, calibration, place), np.clip(np.rint(step), 0, last)
+    start = _pixels(image, calibration, position), np.clip(np.rint(slice_), 0, last)
     first, k, cm, shift = calibration.displacement.walk(image, *start)
     part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[k], -0.5, 0.5)
     inner = (k > 0) & (k < last)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_particle_images import crowd, dense
+from test_renderer import crowd, dense
 
 from gdptlab.fit.background import BOUNDED, Background
 from gdptlab.fit.renderer import ParticleImages

@@ -11,6 +11,7 @@ from conftest import CALIBRATION_SEED, IMAGE_TYPES, Z_UM, table
 from references import correlate_plainly
 
 from gdptlab import Calibration, locate
+from gdptlab._plans import KEPT, planned
 from gdptlab.calibration import VERSION, levelled
 from gdptlab.correlation import normalised
 from gdptlab.denoising import signal_to_noise
@@ -294,7 +295,7 @@ def test_scan_refuses_a_particle_on_the_border(scan, x, y):
 )
 def test_scan_refuses(scan, changes, error, message):
     with pytest.raises(error, match=message):
-        Calibration.from_scan(**({"scan": scan[1], "z_um": SCAN_Z_UM, "x_px": 67, "y_px": 51, "size": 21} | changes))
+        Calibration.from_bead(**({"scan": scan[1], "z_um": SCAN_Z_UM, "x_px": 67, "y_px": 51, "size": 21} | changes))
 
 
 # -------------------- files
@@ -541,35 +542,43 @@ def test_images_at_the_resolution_of_the_search(calibration, clean_stack):
 
 
 class Planned:
-    """A plan that only knows what it was made for."""
+    """A plan that only knows what shape it was made for."""
 
     def __init__(self, calibration, shape):
-        self.calibration, self.shape = calibration, shape
+        self.shape = shape
 
 
 def test_a_plan_is_kept_for_its_thread_and_shape(stacks):
     made = Calibration.from_stack(stacks["fluorescent"][::10], Z_UM[::10], n_sub=3)
-    plan = made.plan(Planned, (70, 80))
-    assert plan.shape == (70, 80) and plan.calibration is made
-    assert made.plan(Planned, (70, 80)) is plan
-    assert made.plan(Planned, (80, 70)) is not plan
+    plan = planned(made, Planned, (70, 80))
+    assert plan.shape == (70, 80)
+    assert planned(made, Planned, (70, 80)) is plan
+    assert planned(made, Planned, (80, 70)) is not plan
     with ThreadPoolExecutor(1) as threads:
-        other = threads.submit(made.plan, Planned, (70, 80)).result()
-    assert other is not plan and made.plan(Planned, (70, 80)) is plan
+        other = threads.submit(planned, made, Planned, (70, 80)).result()
+    assert other is not plan and planned(made, Planned, (70, 80)) is plan
 
 
-def test_plans_stay_behind_when_a_calibration_is_sent(stacks):
+def test_few_plans_are_kept(stacks):
+    made = Calibration.from_stack(stacks["fluorescent"][::10], Z_UM[::10], n_sub=3)
+    first, last = (planned(made, Planned, (70, side)) for side in (80, 81))
+    for side in range(82, 81 + KEPT):
+        planned(made, Planned, (70, 81))  # the one in use stays
+        planned(made, Planned, (70, side))
+    assert planned(made, Planned, (70, 81)) is last and planned(made, Planned, (70, 80)) is not first
+
+
+def test_plans_stay_behind(stacks):
+    """Neither a copy in another process nor one with another subset has the plans, which may hold much memory."""
     made = Calibration.from_stack(stacks["fluorescent"][::10], Z_UM[::10], n_sub=3)
     made.correlator((70, 80))
-    size = len(pickle.dumps(made))
-    plan = made.plan(lambda *_: np.zeros(10**6), (70, 80))  # neither can be pickled, nor should it be
-    made.own_error  # noqa: B018
+    plan = planned(made, Planned, (70, 80))
+    made.expected  # noqa: B018
     sent = pickle.loads(pickle.dumps(made))
-    assert len(pickle.dumps(made)) < size + 10**6
-    assert sent._plans == {} and made._plans and plan.shape == (10**6,)
-    assert "own_error" in sent.__dict__  # what is made only once goes with it
+    assert "expected" in sent.__dict__  # what is made only once goes with it
     np.testing.assert_array_equal(sent.templates, made.templates)
-    assert sent.plan(Planned, (70, 80)).calibration is sent
+    assert planned(sent, Planned, (70, 80)) is not plan
+    assert len(made.with_subset(2).correlator((70, 80))(np.ones((70, 80), np.float32))) == 2
 
 
 @pytest.mark.parametrize("away", [(-9, 0), (6, 8), (0, 0)])
@@ -584,10 +593,10 @@ def test_a_rough_place_will_do(scan, away) -> None:
 def test_an_empty_place_is_refused() -> None:
     noise = np.random.default_rng(2).normal(400, 20, (15, 90, 90))
     with pytest.raises(ValueError, match=r"x_px, y_px: got a particle at .* nothing stands out by more than"):
-        Calibration.from_scan(noise, np.arange(15.0), 44, 45, size=41)
+        Calibration.from_bead(noise, np.arange(15.0), 44, 45, size=41)
     noise[:, 20:24, 20:24] += 600  # in a corner of the template
     with pytest.raises(ValueError, match="beside it, by"):
-        Calibration.from_scan(noise, np.arange(15.0), 40, 40, size=41)
+        Calibration.from_bead(noise, np.arange(15.0), 40, 40, size=41)
 
 
 def test_the_smallest_template(scan):

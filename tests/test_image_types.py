@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gdptlab.experiment.image_types import IMAGE_TYPES, Camera, as_image_type, brightfield, disturbed, fluorescent
+from gdptlab.experiment import Camera
+from gdptlab.experiment.image_types import IMAGE_TYPES, as_image_type, brightfield, disturbed, fluorescent
 
 LIGHT = np.random.default_rng(3).uniform(0, 4000, (30, 47)).astype(np.float32)
 

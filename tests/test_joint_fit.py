@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_particle_images import NOISE, crowd, dense, drawn
+from test_renderer import NOISE, crowd, dense, drawn
 
 from gdptlab.fit.background import Background
 from gdptlab.fit.joint_fit import DAMPING, LONGEST_STEP, fitted

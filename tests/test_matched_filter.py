@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import Z_UM
-from test_particle_images import crowd, drawn
+from test_renderer import crowd, drawn
 
 from gdptlab import Calibration
 from gdptlab.fit.matched_filter import MatchedFilter, packed, smooth_power

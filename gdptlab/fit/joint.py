@@ -40,7 +40,7 @@ def explained(
     steps = np.arange(len(calibration))
     y_std, x_std, step_std = fit.std.T
     stds = x_std, y_std, step_std * np.interp(step, steps, np.gradient(z_um))
-    odd = (amplitude - found.amplitude) / found.spread
+    odd = (amplitude - found.brightness) / found.spread
     misfit = np.sqrt(1 + CORRELATED * np.maximum(fit.chi2 - 1, 0) + (odd / ODD) ** 2)
     for name, noise, own in zip(STD_COLUMNS, stds, calibration.own_error.T, strict=True):
         table[name] = misfit * np.hypot(noise, np.interp(step, steps, own))

@@ -1,54 +1,24 @@
-"""How a shape becomes a depth: the parts of the paper's Figure 2 (notebook 02)."""
+"""How a shape becomes a depth: the four parts of the paper's Figure 2.
 
-from collections.abc import Mapping, Sequence
+Each part draws on the figure (or the part of a figure) that it is given, so that a notebook can show it alone and,
+at the end, all four together.
+"""
 
-import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from gdptlab.calibration import Calibration
 from gdptlab.denoising import signal_to_noise
-from gdptlab.plots.style import (
-    ALIKE,
-    COLOURS,
-    MARK,
-    MARKERS,
-    WARMTH,
-    bare,
-    depth_label,
-    extent,
-    grey,
-    panels,
-    scale_bar,
-    styled,
-)
+from gdptlab.plots.style import ALIKE, COLOURS, MARK, WARMTH, bare, depth_label, extent, grey, panels, scale_bar, styled
 
 
-@styled
-def self_similarity(maps: Mapping[str, NDArray], z_um: NDArray) -> Figure:
-    """Show how alike images of a particle at two depths are, a map for each microscope.
-
-    Parameters
-    ----------
-    maps : dict of arrays (N, N)
-        Correlations, by name.
-    z_um : array (N,)
-
-    Returns
-    -------
-    Figure
-    """
-    figure, [axes] = panels(len(maps), 3.6 * len(maps) + 1, 3.6)
-    for panel, (name, values) in zip(axes, maps.items(), strict=True):
-        shown = draw_similarity(panel, values, z_um)
-        panel.set_title(name)
-    figure.colorbar(shown, ax=axes, label="correlation (line: 0.95)", extend="min", shrink=0.9)
-    return figure
-
-
-def draw_similarity(axes: Axes, values: NDArray, z_um: NDArray) -> object:
+def draw_similarity(axes: Axes, values: NDArray, z_um: NDArray) -> AxesImage:
+    """Draw the correlation (N, N) of the images of a stack with each other, over their depths (N,)."""
     shown = axes.imshow(values, extent=extent(z_um), origin="lower", cmap="cividis", vmin=ALIKE, vmax=1)
     axes.contour(z_um, z_um, values, levels=[0.95], colors="black", linewidths=0.8)
     axes.set(xlabel="z of one image (µm)", ylabel="z of the other (µm)")
@@ -58,7 +28,7 @@ def draw_similarity(axes: Axes, values: NDArray, z_um: NDArray) -> object:
 
 @styled
 def calibration_quality(calibration: Calibration) -> Figure:
-    """Show what limits z before any frame is taken: images alike, and images lost in noise.
+    """Show what limits z before any frame is taken: images that are alike, and images lost in noise.
 
     Parameters
     ----------
@@ -79,242 +49,157 @@ def calibration_quality(calibration: Calibration) -> Figure:
     return figure
 
 
-@styled
-def correlation_peak(window: NDArray, template: NDArray, map_: NDArray, um_per_px: float) -> Figure:
-    """Show one normalised cross-correlation (the paper's Figure 2d): image, template, map and its peak C_m.
+def expected_profiles(figure: Figure | SubFigure, calibration: Calibration, um_per_px: float) -> None:
+    """Draw (a): the stack, the subset taken from it, and the C_m profile that is expected at each depth.
 
     Parameters
     ----------
-    window : array (rows, columns)
-        Part of a frame.
-    template : array (n, n)
-    map_ : array (rows - n + 1, columns - n + 1)
-        Entry [r, c] belongs to the part of the window that starts there.
-    um_per_px : float
-
-    Returns
-    -------
-    Figure
-    """
-    figure = plt.figure(figsize=(9, 2.9), layout="constrained")
-    _correlation_peak(figure, window, template, map_, um_per_px)
-    return figure
-
-
-def _correlation_peak(
-    figure: Figure | SubFigure, window: NDArray, template: NDArray, map_: NDArray, um_per_px: float
-) -> None:
-    axes = figure.subplots(1, 3, width_ratios=[1, 1, 1.15])
-    n = len(template)
-    row, column = np.unravel_index(map_.argmax(), map_.shape)
-    axes[0].imshow(window, **grey(window))
-    axes[0].plot(column + n // 2, row + n // 2, "+", color=MARK, ms=12, mew=2)
-    axes[0].set_title("image")
-    # On a canvas of the same size, so that both are seen at one scale.
-    pad = (len(window) - n) // 2
-    extent = (pad - 0.5, pad + n - 0.5, pad + n - 0.5, pad - 0.5)
-    axes[1].imshow(template, extent=extent)
-    axes[1].set(xlim=axes[0].get_xlim(), ylim=axes[0].get_ylim(), title="template")
-    for panel in axes[:2]:
-        bare(panel)
-    scale_bar(axes[0], um_per_px, 20)
-    reach_x, reach_y = ((m - 1) / 2 for m in map_.shape[::-1])
-    shown = axes[2].imshow(
-        map_, extent=(-reach_x - 0.5, reach_x + 0.5, reach_y + 0.5, -reach_y - 0.5), cmap="cividis", vmin=0, vmax=1
-    )
-    axes[2].plot(column - reach_x, row - reach_y, "+", color=MARK, ms=12, mew=2)
-    axes[2].set(xlabel="shift x (px)", ylabel="shift y (px)", title=f"peak $C_m$ = {map_.max():.2f}")
-    figure.colorbar(shown, ax=axes[2], label="correlation", shrink=0.9)
-
-
-@styled
-def expected_profiles(calibration: Calibration, z_um: Sequence[float] = ()) -> Figure:
-    """Show the map of expected C_m profiles (the paper's Figure 2a), and some of them as curves.
-
-    Parameters
-    ----------
+    figure : Figure or SubFigure
+        To draw on.
     calibration : Calibration
-    z_um : sequence of float
-        Depths whose profiles are drawn beside the map.
-
-    Returns
-    -------
-    Figure
+    um_per_px : float
+        Size of a pixel in the object.
     """
-    figure, [[left, right]] = panels(2, 9, 3.4)
-    _expected_map(figure, left, calibration)
-    subset_z = calibration.z_um[calibration.subset]
-    for colour, marker, z in zip(COLOURS, MARKERS, z_um, strict=False):
-        k = int(np.abs(calibration.z_um - z).argmin())
-        label = f"z = {depth_label(calibration.z_um[k])} µm"
-        right.plot(subset_z, calibration.expected[k], marker=marker, color=colour, label=label)
-        left.axhline(calibration.z_um[k], color=colour, lw=1.5)
-    right.set(xlabel="z of the subset image (µm)", ylabel="expected $C_m$", ylim=(None, 1.02), title="Rows of the map")
-    right.legend(loc="upper left", bbox_to_anchor=(1, 1))
-    return figure
+    z_um, subset, stack = calibration.z_um, calibration.subset, calibration.stack
+    shown = np.unique(np.linspace(0, len(stack) - 1, min(len(stack), 17)).astype(int))
+    upper, lower = figure.subfigures(2, 1, height_ratios=[1, 1.9])
+    strips = upper.subplots(2, max(len(shown), len(subset)), squeeze=False)
+    for strip, chosen, colour in zip(strips, (shown, subset), ("0.6", MARK), strict=True):
+        for panel in strip:
+            bare(panel)
+        for panel, k in zip(strip, chosen, strict=False):
+            panel.imshow(stack[k])
+            panel.set_title(depth_label(z_um[k]), loc="center", fontsize="small", pad=2)
+            panel.spines[:].set(visible=True, color=colour, linewidth=1.5)
+        for panel in strip[len(chosen) :]:
+            panel.set_visible(False)
+    strips[0, 0].set_ylabel(f"stack,\nN = {len(stack)}", fontsize="small")
+    strips[1, 0].set_ylabel(f"subset,\n$N_{{sub}}$ = {len(subset)}", fontsize="small", color=MARK)
+    scale_bar(strips[1, 0], um_per_px, 10)
 
-
-def _expected_map(figure: Figure | SubFigure, axes: Axes, calibration: Calibration) -> None:
-    low, high, *_ = extent(calibration.z_um)
-    count = len(calibration.subset)
-    shown = axes.imshow(
+    map_, rows = lower.subplots(1, 2)
+    low, high, *_ = extent(z_um)
+    drawn = map_.imshow(
         calibration.expected,
-        extent=(0.5, count + 0.5, low, high),
+        extent=(0.5, len(subset) + 0.5, low, high),
         origin="lower",
         aspect="auto",
         cmap="cividis",
         vmin=np.floor(10 * calibration.expected.min()) / 10,
         vmax=1,
     )
-    axes.spines[:].set_visible(False)
-    axes.set(xlabel="subset image", ylabel="z of the particle (µm)", title="Expected $C_m$ profiles, one in each row")
-    axes.set_xticks(np.arange(1, count + 1, max(1, count // 9)))
-    figure.colorbar(shown, ax=axes, label="$C_m$")
+    map_.plot(np.arange(len(subset)) + 1, z_um[subset], ".", color=MARK, ms=5)
+    map_.set(xlabel="number of the subset image", ylabel="z of the particle (µm)", title="Map of expected profiles")
+    map_.set_xticks(np.arange(1, len(subset) + 1, max(1, len(subset) // 9)))
+    lower.colorbar(drawn, ax=map_, label="$C_m$")
+    for colour, k in zip(COLOURS, np.linspace(0, len(stack) - 1, 6).astype(int)[1:-1], strict=False):
+        label = f"z = {depth_label(z_um[k])} µm"
+        rows.plot(z_um[subset], calibration.expected[k], "o-", color=colour, label=label)
+        map_.axhline(z_um[k], color=colour, lw=1.5)
+    rows.set(xlabel="z of the subset image (µm)", ylabel="expected $C_m$", ylim=(None, 1.02), title="Rows of the map")
+    rows.legend(fontsize="small")
 
 
-@styled
-def correlation_maps(
-    frame: NDArray, maps: NDArray, calibration: Calibration, particle: tuple[float, float] | None = None
-) -> Figure:
-    """Show a frame and its correlation maps (the paper's Figure 2b).
+def maps_around(
+    figure: Figure | SubFigure, frame: NDArray, maps: NDArray, calibration: Calibration, particle: pd.Series
+) -> None:
+    """Draw (b): the frame, and what each correlation map shows around one particle, with its C_m.
 
     Parameters
     ----------
+    figure : Figure or SubFigure
+        To draw on.
     frame : array (rows, columns)
-    maps : array (n_sub, r, c)
-        Correlation of the frame with the calibration's subset, at the resolution of the search.
+    maps : array (N_sub, r, c)
+        Correlation of the frame with the subset, at the resolution of the search.
     calibration : Calibration
-    particle : (float, float), optional
-        x and y in px of a particle to mark.
-
-    Returns
-    -------
-    Figure
+    particle : Series
+        `x_px`, `y_px` of the particle.
     """
-    figure = plt.figure(figsize=(9.4, 4.4), layout="constrained")
-    _correlation_maps(figure, frame, maps, calibration, particle)
-    return figure
-
-
-def _correlation_maps(
-    figure: Figure | SubFigure,
-    frame: NDArray,
-    maps: NDArray,
-    calibration: Calibration,
-    particle: tuple[float, float] | None,
-) -> None:
-    rows = int(np.floor(np.sqrt(len(maps))))
-    columns = -(-len(maps) // rows)
-    left, right = figure.subfigures(1, 2, width_ratios=[1, 1.05])
+    scale = 2 if calibration.half_resolution else 1
+    margin, half = calibration.search_templates.shape[-1] // 2, calibration.size // 2
+    column, row = (round(particle[name] / scale) - margin for name in ("x_px", "y_px"))
+    reach = half // scale
+    count = -(-len(maps) // 3)
+    left, right = figure.subfigures(1, 2, width_ratios=[1.1, 1])
     axes = left.subplots()
     axes.imshow(frame, **grey(frame))
-    axes.set(xlabel="x (px)", ylabel="y (px)", title="Frame")
-    grid = right.subplots(rows, columns, squeeze=False).ravel()
-    scale = 2 if calibration.half_resolution else 1
-    first = calibration.search_templates.shape[-1] // 2 * scale
-    end_y, end_x = (first + scale * (n - 1) for n in maps.shape[1:])
-    extent = (first - scale / 2, end_x + scale / 2, end_y + scale / 2, first - scale / 2)
-    for panel, map_, z in zip(grid, maps, calibration.z_um[calibration.subset], strict=False):
-        shown = panel.imshow(map_, extent=extent, cmap=WARMTH, vmin=0, vmax=1)
-        panel.set_title(f"{depth_label(z)} µm", fontsize="small", pad=2)
+    corner = particle["x_px"] - half, particle["y_px"] - half
+    axes.add_patch(Rectangle(corner, 2 * half, 2 * half, fill=False, color=MARK, lw=1.8))
+    axes.set(xlabel="x (px)", ylabel="y (px)", title="Frame, and the particle that is followed")
+    grid = right.subplots(3, count, squeeze=False).ravel()
+    right.suptitle("Its surroundings in each correlation map: $C_m$", fontsize=10)
     for panel in grid:
-        bare(panel)
-    for panel in grid[len(maps) :]:
         panel.set_visible(False)
-    right.colorbar(shown, ax=grid, label="correlation", shrink=0.8)
-    if particle is not None:
-        for panel in (axes, *grid[: len(maps)]):
-            size = 22 if panel is axes else 12
-            panel.plot(*particle, "o", color=MARK, mfc="none", ms=size, mew=1.8 if panel is axes else 1.2)
+    for panel, map_, z in zip(grid, maps, calibration.z_um[calibration.subset], strict=False):
+        r, c = max(row - reach, 0), max(column - reach, 0)
+        part = map_[r : row + reach + 1, c : column + reach + 1]
+        panel.set_visible(True)
+        shown = panel.imshow(part, cmap=WARMTH, vmin=0, vmax=1)
+        peak = map_[row - 1 : row + 2, column - 1 : column + 2].max()
+        panel.plot(column - c, row - r, "+", color=MARK, ms=8)
+        panel.set_title(f"{depth_label(z)} µm: {peak:.2f}", loc="center", fontsize="small", pad=2)
+        bare(panel)
+    right.colorbar(shown, ax=grid.tolist(), label="correlation", shrink=0.8)
 
 
-@styled
-def profile_match(profile: NDArray, calibration: Calibration, likeness: NDArray) -> Figure:
-    """Show how a measured C_m profile finds its z (the paper's Figure 2c).
+def profile_match(figure: Figure | SubFigure, profile: NDArray, calibration: Calibration, agreement: NDArray) -> None:
+    """Draw (c): how a measured C_m profile finds its z.
 
     Parameters
     ----------
-    profile : array (n_sub,)
+    figure : Figure or SubFigure
+        To draw on.
+    profile : array (N_sub,)
         Measured C_m in each of the subset's maps.
     calibration : Calibration
-    likeness : array (N,)
-        How well the profile agrees with that expected at each depth of the calibration.
-
-    Returns
-    -------
-    Figure
+    agreement : array (N,)
+        Correlation of the profile with the profile expected at each depth.
     """
-    figure = plt.figure(figsize=(9, 3.2), layout="constrained")
-    _profile_match(figure, profile, calibration, likeness)
-    return figure
-
-
-def _profile_match(figure: Figure | SubFigure, profile: NDArray, calibration: Calibration, likeness: NDArray) -> None:
     left, right = figure.subplots(1, 2)
-    subset_z, z_um, best = calibration.z_um[calibration.subset], calibration.z_um, int(likeness.argmax())
+    subset_z, z_um, best = calibration.z_um[calibration.subset], calibration.z_um, int(agreement.argmax())
     left.plot(subset_z, calibration.expected.T, color="0.85", lw=0.8, zorder=0)
     left.plot(subset_z, calibration.expected[best], color=COLOURS[0], label=f"expected at {depth_label(z_um[best])} µm")
     left.plot(subset_z, profile, "o", color=MARK, label="measured")
     left.set(xlabel="z of the subset image (µm)", ylabel="$C_m$", ylim=(None, 1.02), title="Measured profile")
     left.legend(loc="lower center", fontsize="small")
-    right.plot(z_um, likeness, color=COLOURS[0])
-    right.plot(z_um[best], likeness[best], "o", color=MARK, ms=7)
-    right.annotate(f"{depth_label(z_um[best])} µm", (z_um[best], likeness[best]), (6, -14), textcoords="offset points")
+    right.plot(z_um, agreement, color=COLOURS[0])
+    right.plot(z_um[best], agreement[best], "o", color=MARK, ms=7)
+    right.annotate(f"{depth_label(z_um[best])} µm", (z_um[best], agreement[best]), (6, -14), textcoords="offset points")
     right.set(xlabel="z of the expected profile (µm)", ylabel="agreement", title="z is where the two agree best")
 
 
-@styled
-def fig2_calibration_map(
-    calibration: Calibration,
-    frame: NDArray,
-    maps: NDArray,
-    particle: tuple[float, float],
-    profile: NDArray,
-    likeness: NDArray,
-    peak: tuple[NDArray, NDArray, NDArray],
-    um_per_px: float,
-) -> Figure:
-    """Draw the paper's Figure 2: from the calibration stack to a particle's z.
+def correlation_peak(
+    figure: Figure | SubFigure, window: NDArray, template: NDArray, map_: NDArray, um_per_px: float
+) -> None:
+    """Draw (d): one normalised cross-correlation, with its peak C_m.
 
     Parameters
     ----------
-    calibration : Calibration
-        For (a): the subset of its stack, and its map of expected profiles.
-    frame, maps, particle
-        For (b), as in `correlation_maps`.
-    profile, likeness
-        For (c), as in `profile_match`.
-    peak : (window, template, map)
-        For (d), as in `correlation_peak`.
+    figure : Figure or SubFigure
+        To draw on.
+    window : array (rows, columns)
+        Part of a frame.
+    template : array (n, n)
+    map_ : array (rows - n + 1, columns - n + 1)
+        Entry [r, c] belongs to the part of the window that starts there.
     um_per_px : float
-
-    Returns
-    -------
-    Figure
+        Size of a pixel in the object.
     """
-    figure = plt.figure(figsize=(9, 13.6), layout="constrained")
-    a, b, c, d = figure.subfigures(4, 1, height_ratios=[3.4, 4.4, 3.1, 2.9])
-    for part, letter, title in (
-        (a, "a", "Calibration: subset of the stack, and the profile expected at each depth"),
-        (b, "b", "Evaluation: the frame correlated with each image of the subset"),
-        (c, "c", "The particle in the circle: measured profile against the expected ones"),
-        (d, "d", "What $C_m$ is: the peak of a normalised cross-correlation"),
-    ):
-        part.suptitle(f"({letter})  {title}", x=0.01, ha="left", weight="bold", fontsize=11)
-    pictures, map_ = a.subfigures(1, 2, width_ratios=[0.75, 1])
-    count = len(calibration.subset)
-    rows = int(np.floor(np.sqrt(count)))
-    grid = pictures.subplots(rows, -(-count // rows), squeeze=False).ravel()
-    for number, (panel, k) in enumerate(zip(grid, calibration.subset, strict=False), 1):
-        panel.imshow(calibration.stack[k])
-        panel.set_title(f"{number}: {depth_label(calibration.z_um[k])} µm", fontsize="small", pad=2)
-    for panel in grid:
+    axes = figure.subplots(1, 3, width_ratios=[1, 1, 1.15])
+    n = len(template)
+    row, column = np.unravel_index(map_.argmax(), map_.shape)
+    axes[0].imshow(window, **grey(window))
+    axes[0].plot(column + n // 2, row + n // 2, "+", color=MARK, ms=12, mew=2)
+    axes[0].set_title("image")
+    pad = (len(window) - n) // 2  # on a canvas of the same size, so that both are seen at one scale
+    axes[1].imshow(template, extent=(pad - 0.5, pad + n - 0.5, pad + n - 0.5, pad - 0.5))
+    axes[1].set(xlim=axes[0].get_xlim(), ylim=axes[0].get_ylim(), title="template")
+    for panel in axes[:2]:
         bare(panel)
-    for panel in grid[count:]:
-        panel.set_visible(False)
-    scale_bar(grid[0], um_per_px, 10)
-    _expected_map(map_, map_.subplots(), calibration)
-    _correlation_maps(b, frame, maps, calibration, particle)
-    _profile_match(c, profile, calibration, likeness)
-    _correlation_peak(d, *peak, um_per_px)
-    return figure
+    scale_bar(axes[0], um_per_px, 20)
+    y, x = ((m - 1) / 2 for m in map_.shape)
+    shown = axes[2].imshow(map_, extent=(-x - 0.5, x + 0.5, y + 0.5, -y - 0.5), cmap="cividis", vmin=0, vmax=1)
+    axes[2].plot(column - x, row - y, "+", color=MARK, ms=12, mew=2)
+    axes[2].set(xlabel="shift x (px)", ylabel="shift y (px)", title=f"peak $C_m$ = {map_.max():.2f}")
+    figure.colorbar(shown, ax=axes[2], label="correlation", shrink=0.9)

@@ -38,6 +38,7 @@ def z_errors(pairs: Mapping[str, pd.DataFrame], edges_um: Sequence[float]) -> Fi
 
 
 SCORES = {"recall": "recall", "precision": "precision", "sigma_z_um": "σ$_z$ (µm)"}
+"""Labels of the scores that can be drawn."""
 
 
 @styled
@@ -80,7 +81,7 @@ def score_curves(
                 table.index, table[column], yerr=spread, color=colour, marker=marker, mfc="none", label=name, capsize=2
             )
         ends = (t.get(f"{column}_high", t[column] + t.get(f"{column}_std", 0)) for t in tables.values())
-        top = max(end.max() for end in ends)
+        top = np.nanmax([0.1, *(end.max() for end in ends)])  # a score is NaN where nothing was found
         panel.set(xlabel=x_label, ylabel=SCORES[column], xscale="log" if log else "linear")
         ticks = np.unique(np.concatenate([t.index for t in tables.values()]))
         if log:

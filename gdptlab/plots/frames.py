@@ -1,4 +1,4 @@
-"""Frames, particles and calibration images as pictures (notebooks 00, 01 and 03)."""
+"""Frames, particles in space, and images of one particle beside each other."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from gdptlab.plots.style import COLOURS, DEPTH, bare, depth_label, grey, is_dark, panels, scale_bar, styled
+from gdptlab.plots.style import DEPTH, GREY, bare, depth_label, grey, is_dark, panels, scale_bar, stretched, styled
 
 
 @styled
@@ -32,7 +32,7 @@ def frame_with_particles(
     z_limits_um : (float, float)
         Ends of the scale of colours.
     window_px : int, optional
-        Size of the templates; a dashed line then bounds the places where one fits into the frame.
+        Size of the templates. A dashed line then bounds the positions at which a template fits into the frame.
 
     Returns
     -------
@@ -77,6 +77,8 @@ def particles_3d(
     *,
     z_limits_um: tuple[float, float] = (-50, 50),
     true: pd.DataFrame | None = None,
+    elevation: float = 24,
+    azimuth: float = -62,
 ) -> Figure:
     """Show particles where they are in space, to scale.
 
@@ -89,6 +91,8 @@ def particles_3d(
     z_limits_um : (float, float)
     true : DataFrame, optional
         True particles, drawn as crosses.
+    elevation, azimuth : float
+        Direction of view, degrees.
 
     Returns
     -------
@@ -118,7 +122,7 @@ def particles_3d(
     axes.yaxis.set_inverted(True)  # as in the image
     spans = [np.diff(limits).item() for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
     axes.set_box_aspect(np.abs(spans), zoom=0.92)
-    axes.view_init(elev=24, azim=-62)
+    axes.view_init(elev=elevation, azim=azimuth)
     figure.colorbar(dots, label="z (µm)", shrink=0.6, pad=0.08)
     if true is not None:
         axes.legend(loc="upper left")
@@ -126,10 +130,8 @@ def particles_3d(
 
 
 @styled
-def contact_sheet(
-    stacks: Mapping[str, NDArray], z_um: Sequence[float], um_per_px: float, *, common_scale: bool = False
-) -> Figure:
-    """Show images of one particle, a row for each stack and a column for each depth.
+def contact_sheet(stacks: Mapping[str, NDArray], z_um: Sequence[float], um_per_px: float) -> Figure:
+    """Show images of one particle, a row for each stack and a column for each depth; each has its own scale of grey.
 
     Parameters
     ----------
@@ -138,8 +140,6 @@ def contact_sheet(
     z_um : sequence (N,)
     um_per_px : float
         Size of a pixel in the object.
-    common_scale : bool
-        One scale of grey for all images of a row. If not, each image has its own, to show its shape.
 
     Returns
     -------
@@ -150,8 +150,7 @@ def contact_sheet(
     figure, axes = panels(columns, width, rows * width / columns + 0.45, rows=rows)
     for line, (name, stack) in zip(axes, stacks.items(), strict=True):
         for panel, image in zip(line, stack, strict=True):
-            scaled = stack if common_scale else image
-            panel.imshow(image, vmin=float(np.min(scaled)), vmax=float(np.max(scaled)))
+            panel.imshow(image)
             bare(panel)
         line[0].set_ylabel(name)
         scale_bar(line[0], um_per_px, 10)
@@ -162,81 +161,26 @@ def contact_sheet(
 
 
 @styled
-def width_and_peak(tables: Mapping[str, pd.DataFrame]) -> Figure:
-    """Plot how wide and how bright a particle's image is against its depth.
-
-    Parameters
-    ----------
-    tables : dict of DataFrame
-        By the microscope's name: columns `z_um`, `width_x_um`, `width_y_um`, `peak_counts`.
-
-    Returns
-    -------
-    Figure
-    """
-    figure, [axes] = panels(len(tables) + 1, 10, 3.2)
-    highest = max(t[["width_x_um", "width_y_um"]].to_numpy().max() for t in tables.values())
-    for panel, (colour, (name, table)) in zip(axes, zip(COLOURS, tables.items(), strict=False), strict=False):
-        panel.plot(table["z_um"], table["width_x_um"], color=colour, label="along x")
-        panel.plot(table["z_um"], table["width_y_um"], color="black", ls=(0, (4, 2)), label="along y")
-        panel.set(title=name, xlabel="z (µm)", ylabel="RMS width (µm)", ylim=(0, 1.08 * highest))
-        panel.legend()
-        axes[-1].plot(table["z_um"], table["peak_counts"], color=colour, label=name)
-    axes[-1].set(title="Brightest pixel", xlabel="z (µm)", ylabel="light (counts)", ylim=(0, None))
-    axes[-1].legend(fontsize="small")
-    return figure
-
-
-@styled
-def compared_images(images: Mapping[str, NDArray], um_per_px: float) -> Figure:
-    """Show two images of one particle and their difference.
-
-    Parameters
-    ----------
-    images : dict of two arrays (rows, columns)
-        By name.
-    um_per_px : float
-
-    Returns
-    -------
-    Figure
-    """
-    (name, first), (other, second) = images.items()
-    figure, [axes] = panels(3, 9, 3.2)
-    top = max(first.max(), second.max())
-    for panel, title, image in zip(axes, (name, other), (first, second), strict=False):
-        shown = panel.imshow(image, vmin=0, vmax=top)
-        panel.set_title(title)
-    figure.colorbar(shown, ax=axes[:2], label="light (counts)", shrink=0.8)
-    difference = 100 * (second - first) / top
-    reach = np.abs(difference).max()
-    shown = axes[2].imshow(difference, cmap="PuOr", vmin=-reach, vmax=reach)
-    axes[2].set_title("second − first")
-    figure.colorbar(shown, ax=axes[2], label="% of the peak", shrink=0.8)
-    for panel in axes:
-        bare(panel)
-    scale_bar(axes[0], um_per_px, 10)
-    return figure
-
-
-@styled
-def fig3_image_types(images: Mapping[str, NDArray], um_per_px: float) -> Figure:
-    """Draw the paper's Figure 3: one scene in several kinds of image.
+def side_by_side(images: Mapping[str, NDArray], um_per_px: float, bar_um: float = 50) -> Figure:
+    """Show frames side by side, stretched such that dim particles show and bright ones are not saturated.
 
     Parameters
     ----------
     images : dict of arrays (rows, columns)
-        By the name of the kind.
+        By the title of each.
     um_per_px : float
+        Size of a pixel in the object.
+    bar_um : float
+        Length of the scale bar.
 
     Returns
     -------
     Figure
     """
-    figure, [axes] = panels(len(images), 3.5 * len(images), 3.8)
-    for letter, panel, (name, image) in zip("abcdefgh", axes, images.items(), strict=False):
-        panel.imshow(image, **grey(image, 1.5))
+    figure, [axes] = panels(len(images), 10, 10 / len(images) + 0.4)
+    for panel, (title, image) in zip(axes, images.items(), strict=True):
+        panel.imshow(stretched(image), cmap=GREY, vmin=0, vmax=1)
         bare(panel)
-        panel.set_title(f"({letter}) {name}")
-        scale_bar(panel, um_per_px, 50)
+        panel.set_title(title)
+        scale_bar(panel, um_per_px, bar_um)
     return figure

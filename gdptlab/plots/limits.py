@@ -1,6 +1,6 @@
 """Pictures of how accurate a measurement can be, is, and whether it leans to one side.
 
-As in `figures`: each takes data and returns a matplotlib Figure.
+Each function takes data and returns a matplotlib Figure.
 """
 
 from collections.abc import Mapping

@@ -1,6 +1,6 @@
 """Pictures of a monitor at work, while it works and afterwards.
 
-As in `figures`: each takes data and returns a matplotlib Figure. What concerns the middle third of the height is
+Each takes data and returns a matplotlib Figure. What concerns the middle third of the height is
 blue, of the width orange, as everywhere.
 """
 

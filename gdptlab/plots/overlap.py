@@ -1,6 +1,6 @@
 """Pictures of particles that overlap: which are found, what they leave of a frame, how far errors are known.
 
-As in `figures`: each takes data and returns a matplotlib Figure.
+Each function takes data and returns a matplotlib Figure.
 """
 
 from collections.abc import Mapping, Sequence

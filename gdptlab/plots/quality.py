@@ -1,6 +1,6 @@
 """Pictures that tell whether to trust a calibration, and what was measured with it.
 
-As in `figures`: each takes data and returns a matplotlib Figure.
+Each function takes data and returns a matplotlib Figure.
 """
 
 from collections.abc import Mapping

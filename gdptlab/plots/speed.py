@@ -1,6 +1,6 @@
 """Pictures of how long things take: of frames, of their parts, of films, of a camera that does not wait.
 
-As in `figures`: each takes data and returns a matplotlib Figure.
+Each function takes data and returns a matplotlib Figure.
 """
 
 from collections.abc import Mapping
@@ -31,10 +31,9 @@ def frame_times(times: pd.DataFrame, floors: Mapping[str, pd.Series] | None = No
     -------
     Figure
     """
-    panels, methods = times["varied"].unique(), times["method"].unique()
-    figure, axes = panels(len(panels), 3.1 * len(panels), 3.6, sharey=True)
-    axes = axes[0]
-    for panel, varied in zip(axes, panels, strict=True):
+    names, methods = times["varied"].unique(), times["method"].unique()
+    figure, [axes] = panels(len(names), 3.1 * len(names), 3.6, sharey=True)
+    for panel, varied in zip(axes, names, strict=True):
         here = times[times["varied"] == varied]
         for i, method in enumerate(methods):
             line = here[here["method"] == method].sort_values("value")

@@ -1,6 +1,6 @@
 """Pictures of tracks, of the velocities along them, and of the energy density that follows.
 
-As in `figures`: each takes data and returns a matplotlib Figure.
+Each function takes data and returns a matplotlib Figure.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,0 +1,178 @@
+"""The paper's Figure 5: how wrong a trigger is, against the time that an evaluation takes."""
+
+from collections.abc import Mapping
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+
+from gdptlab.plots.experiment import LINES, TRIGGERS
+from gdptlab.plots.style import COLOURS, MARKERS, panels, styled
+
+BAND = "0.86"
+"""Grey of the delay that the clock alone explains."""
+
+PAPER_S = 1.0
+"""Evaluation time on the paper's laptop, s (paper, section 4.1: about 1 s)."""
+
+
+def _band(axes: Axes, band: pd.DataFrame) -> None:
+    """Draw the delay that is expected by chance, and where the paper's laptop was."""
+    axes.fill_between(band["tau_s"], band["low_s"], band["high_s"], color=BAND, lw=0)
+    axes.plot(band["tau_s"], band["mean_s"], color="0.6", lw=2)
+    axes.axhline(0, color="black", lw=0.8)
+    axes.axvline(PAPER_S, color="0.4", lw=1, ls=":")
+    axes.set(xscale="log", ylabel="error (s)")
+    ticks = (0.01, 0.03, 0.1, 0.3, 1, 3)
+    axes.set_xticks(ticks, labels=[f"{t:g}" for t in ticks])
+    axes.minorticks_off()
+
+
+def _point(axes: Axes, x: float, row: pd.Series, vertical: bool = True, **look: object) -> None:
+    """Draw a median and its quartiles."""
+    ends = [[row["median"] - row["q25"]], [row["q75"] - row["median"]]]
+    bars = {"yerr": ends} if vertical else {"xerr": ends}
+    at = (x, row["median"]) if vertical else (row["median"], x)
+    axes.errorbar(*at, **bars, lw=1, ms=6, ls="", **look)
+
+
+@styled
+def fig5_times(points: pd.DataFrame, band: pd.DataFrame, colour: str, letters: str = "ab") -> Figure:
+    """Draw the error of both triggers against the measured evaluation time (the paper's Figure 5 a, b, d and e).
+
+    Parameters
+    ----------
+    points : DataFrame
+        From `figure5.verdicts`, by `trigger`, `tau_s`, `refine`, `evaluator` and the column `colour`.
+    band : DataFrame
+        From `replay.expected_delay`: grey. Its mean is the grey line.
+    colour : str
+        Column of `points` that is told apart by colour. Markers tell the evaluators apart; open: not refined.
+    letters : str
+        Letters of the panels.
+
+    Returns
+    -------
+    Figure
+        Medians and quartiles of the films that did not fail; the strip on top counts those that did, in per cent.
+    """
+    figure, axes = panels(2, 10, 5.2, rows=2, height_ratios=[1, 3.4], sharex=True)
+    colours = dict(zip(points[colour].drop_duplicates(), COLOURS, strict=False))
+    markers = dict(zip(points["evaluator"].drop_duplicates(), MARKERS, strict=False))
+    films = int(points["films"].max())
+    for k, (trigger, symbol) in enumerate(TRIGGERS.items()):
+        strip, panel = axes[:, k]
+        _band(panel, band)
+        for _, row in points[points["trigger"] == trigger].iterrows():
+            c, m = colours[row[colour]], markers[row["evaluator"]]
+            look = {"color": c, "marker": m, "mfc": c if row["refine"] else "white"}
+            _point(panel, row["tau_s"], row, **look)
+            strip.plot(row["tau_s"], 100 * row["failed"], ls="", ms=5, **look)
+        strip.axvline(PAPER_S, color="0.4", lw=1, ls=":")
+        strip.set(ylim=(-8, 108), yticks=(0, 50, 100), title=f"({letters[k]})  {symbol}")
+        strip.grid(axis="y", color="0.9")
+        panel.set(xlabel="measured evaluation time τ (s)")
+    axes[0, 0].set_ylabel("failed (%)")
+    axes[0, 1].annotate(" 1 s: the\n paper's laptop", (PAPER_S, 95), va="top", fontsize="small", color="0.3")
+    handles = [Line2D([], [], color=c, lw=4, label=str(name)) for name, c in colours.items()]
+    handles += [Line2D([], [], color="0.3", marker=m, ls="", label=name) for name, m in markers.items()]
+    handles += [
+        Line2D([], [], color="0.3", marker="o", ls="", label="refined"),
+        Line2D([], [], color="0.3", marker="o", ls="", mfc="white", label="not refined"),
+        Rectangle((0, 0), 1, 1, color=BAND, label="delay of a perfect monitor (line: mean)"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small", title=f"{films} films")
+    return figure
+
+
+@styled
+def fig5_settings(points: pd.DataFrame, labels: Mapping[tuple, str], counts: Mapping[str, pd.DataFrame]) -> Figure:
+    """Draw the error of both triggers for each setting, and the number of particles against time (Figure 5 c, f).
+
+    Parameters
+    ----------
+    points : DataFrame
+        From `figure5.verdicts`, indexed by setting, by `trigger` and `refine`.
+    labels : dict of str
+        What is written beside each setting, in order from top to bottom.
+    counts : dict of DataFrame
+        By name: `count` and `valid` against time in s (index); the one named 'true' has `count` alone.
+
+    Returns
+    -------
+    Figure
+        Medians and quartiles of the films that did not fail, and in words how many failed, with the 95 % interval.
+    """
+    figure, [axes] = panels(3, 11, 1.6 + 0.42 * len(labels), width_ratios=[1, 1, 0.9])
+    for panel, (trigger, symbol) in zip(axes, TRIGGERS.items(), strict=False):
+        here = points[points["trigger"] == trigger]
+        for y, setting in enumerate(labels):
+            for refine, up in ((True, -0.16), (False, 0.16)):
+                row = here[(here.index == setting) & (here["refine"] == refine)].iloc[0]
+                look = {"color": COLOURS[0 if refine else 1], "marker": "o" if refine else "s"}
+                _point(panel, y + up, row, vertical=False, **look | {"mfc": look["color"] if refine else "white"})
+                text = f"{row['failed']:.0%} ({row['failed_low']:.0%}–{row['failed_high']:.0%})"
+                at = {"xycoords": ("axes fraction", "data"), "va": "center", "ha": "right", "fontsize": "x-small"}
+                panel.annotate(text, (0.995, y + up), color=look["color"], **at)
+        low, high = here["q25"].min(), here["q75"].max()
+        panel.axvline(0, color="black", lw=0.8)
+        panel.set(xlim=(low - 0.1, high + 0.6 * (high - low) + 0.2), ylim=(len(labels) - 0.5, -0.5))
+        panel.set(xlabel="error (s)", title=f"{symbol}; right: failed", yticks=range(len(labels)))
+        panel.set_yticklabels(labels.values() if trigger == "h" else [])
+        panel.grid(axis="y", color="0.93")
+    last = axes[2]
+    for i, (name, table) in enumerate(counts.items()):
+        colour = "black" if name == "true" else COLOURS[i]
+        last.plot(table.index, table["count"], color=colour, lw=1, ls=":", label=name if name == "true" else None)
+        if "valid" in table:
+            last.plot(table.index, table["valid"], color=colour, ls=LINES[i % 4], label=name)
+    last.set(xlabel="t (s)", ylabel="particles", ylim=(0, None), title="Valid (line) and all detected (dots)")
+    last.legend(fontsize="small", loc="lower left")
+    handles = [
+        Line2D([], [], color=COLOURS[0], marker="o", label="refined"),
+        Line2D([], [], color=COLOURS[1], marker="s", mfc="white", label="not refined"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize="small")
+    return figure
+
+
+@styled
+def error_against_tau(points: pd.DataFrame, band: pd.DataFrame, by: str) -> Figure:
+    """Plot the error against an imposed evaluation time, over what the clock alone would do.
+
+    Parameters
+    ----------
+    points : DataFrame
+        From `figure5.verdicts`, by `trigger`, `tau_s` and the column `by`.
+    band : DataFrame
+        From `replay.expected_delay`.
+    by : str
+        Column of what is compared.
+
+    Returns
+    -------
+    Figure
+        Medians of the replays that did not fail, with the quartiles of the first as a shade; above, how many failed.
+    """
+    figure, axes = panels(2, 10, 4.8, rows=2, height_ratios=[1.3, 3], sharex=True)
+    for k, (trigger, symbol) in enumerate(TRIGGERS.items()):
+        strip, panel = axes[:, k]
+        _band(panel, band)
+        for i, (name, part) in enumerate(points[points["trigger"] == trigger].groupby(by, sort=False)):
+            part = part.sort_values("tau_s")
+            look = {"color": COLOURS[i], "ls": LINES[i % 4], "marker": MARKERS[i], "ms": 4}
+            if i == 0:
+                panel.fill_between(part["tau_s"], part["q25"], part["q75"], color=COLOURS[0], alpha=0.25, lw=0)
+            panel.plot(part["tau_s"], part["median"], **look, label=name)
+            strip.plot(part["tau_s"], 100 * part["failed"], **look)
+        strip.axvline(PAPER_S, color="0.4", lw=1, ls=":")
+        strip.set(ylim=(-8, 108), yticks=(0, 50, 100), title=symbol)
+        strip.grid(axis="y", color="0.9")
+        panel.set(
+            xlabel="imposed evaluation time τ (s)", xlim=(0.9 * points["tau_s"].min(), 1.1 * points["tau_s"].max())
+        )
+    axes[0, 0].set_ylabel("failed (%)")
+    axes[1, 0].legend(loc="upper left", fontsize="small")
+    return figure
