@@ -20,8 +20,9 @@ LOSSLESS = 0.98
 DEBUG = None
 ODD = 1.5
 SHARP_GAIN = 2.0
+LOCAL = 0.5
 CYCLES = 4
-MOVE = [True, False]
+MOVE = [False, False]
 WH = [True,True]
 APART = 3.0
 STEPS = 5
@@ -82,7 +83,7 @@ class Joint:
             population = _population(fit, keep, population)
             variance = learned_variance(fit.image, fit.residual, 1.0)
             weight = variance.weight(fit.image, pixels.valid)
-            odd = (fit.chi2 > 1.5)[keep]
+            odd = self._odd(fit, keep)
             self._report(f"full {cycle} odd {odd.sum()}", places, [])
             if cycle == CYCLES - 1 or not odd.any():
                 break
@@ -126,6 +127,12 @@ class Joint:
             near = np.hypot(*(fit.places[i, :2] - fit.places[drop, :2]).T) < self.model.size / 6 / (1 if shape == self.shape else self._scale)
             drop[i] = not near.any()
         return ~drop, gain
+
+    def _odd(self, fit, keep):
+        chi2, places = fit.chi2[keep], fit.places[keep]
+        away = np.hypot(*(places[:, None, :2] - places[:, :2]).T)
+        worst = np.where(away < self.model.size / 2, chi2, 0).max(axis=1)
+        return (chi2 > 1.5) & (chi2 > LOCAL * worst)
 
     def _moved(self, renderer, fit, keep, variance, valid):
         """Places of the particles that stay, the odd ones at another depth where that is likelier."""
