@@ -20,10 +20,15 @@ LOSSLESS = 0.98
 DEBUG = None
 ODD = 1.5
 SHARP_GAIN = 2.0
+FULL = 3
+ODDS = 2.0
+CHI = None
+KAPPA = 0.3
 LOCAL = 0.5
+ODDS = 2.0
 CYCLES = 4
 MOVE = [False, False]
-WH = [True,True]
+WH = [True, False]
 APART = 3.0
 STEPS = 5
 
@@ -71,8 +76,8 @@ class Joint:
         frame = (pixels.filled - np.median(pixels.filled[::4, ::4])) / np.float32(pixels.noise)
         places, population, variance, background = np.zeros((0, 4)), None, Variance(), None
         weight = variance.weight(frame, pixels.valid)
-        for cycle in range(CYCLES):
-            places, population = self._search(frame, pixels, places, population)
+        places, population = self._search(frame, pixels, places, population)
+        for again in range(FULL):
             fit = self._fitted(frame, places, weight, population, background, STEPS)
             keep, _ = self._stays(self._renderer, fit, weight, self._error)
             if MOVE[1]:
@@ -82,12 +87,13 @@ class Joint:
             background = fit.background
             population = _population(fit, keep, population)
             variance = learned_variance(fit.image, fit.residual, 1.0)
+            self._pop = population
+            new = self._unexplained(fit, pixels, population, weight) if again < FULL - 1 else []
             weight = variance.weight(fit.image, pixels.valid)
-            odd = self._odd(fit, keep)
-            self._report(f"full {cycle} odd {odd.sum()}", places, [])
-            if cycle == CYCLES - 1 or not odd.any():
+            self._report(f"full {again}", places, new)
+            if not len(new):
                 break
-            places = places[~odd]
+            places = np.concatenate([places, new])
         fit = self._fitted(frame, places, weight, population, background, 3)
         while True:
             keep, gain = self._stays(self._renderer, fit, weight, self._error)
@@ -128,11 +134,18 @@ class Joint:
             drop[i] = not near.any()
         return ~drop, gain
 
-    def _odd(self, fit, keep):
-        chi2, places = fit.chi2[keep], fit.places[keep]
-        away = np.hypot(*(places[:, None, :2] - places[:, :2]).T)
+    def _odd(self, renderer, fit, keep, weight, error):
+        """Which of the particles that stay have a residual beyond noise and errors of patterns, more than their neighbours."""
+        scale = 1 if renderer is self._renderer else self._scale
+        total = self._errors(renderer, fit.places, error, fit.frame.shape)
+        expected = fit.chi2_of(np.sqrt(total), weight)[keep]
+        chi2 = fit.chi2[keep]
+        chi2 = chi2 / (np.median(chi2 / (1 + KAPPA * expected)) * (1 + KAPPA * expected))
+        if CHI: CHI(self, fit.places[keep] * (scale, scale, 1, 1), chi2)
+        places = fit.places[keep]
+        away = np.hypot(*(places[:, None, :2] - places[:, :2]).T) * scale
         worst = np.where(away < self.model.size / 2, chi2, 0).max(axis=1)
-        return (chi2 > 1.5) & (chi2 > LOCAL * worst)
+        return (chi2 > ODDS) & (chi2 > LOCAL * worst)
 
     def _moved(self, renderer, fit, keep, variance, valid):
         """Places of the particles that stay, the odd ones at another depth where that is likelier."""
@@ -180,27 +193,36 @@ class Joint:
         sharp = _high_passed(small[None], self._blur)[0]
         places, background = places / (scale, scale, 1, 1), np.float32(0)
         image = self._small.image(places, small.shape)
-        for stage, rounds in (("sharp", 5), ("plain", 3)):
-            renderer = self._sharp if stage == "sharp" else self._small
-            for r in range(rounds):
-                if stage == "plain":
-                    background = self._small_surface.fit(small - image, weight)
-                total = self._errors(self._small, places, self._small_error, small.shape)
-                left = (small - image - background) / np.sqrt(1 + scale**2 * total)
-                new = self._new(left, population, whiten=stage == "sharp" or WH[0])
-                self._report(f"{stage}{r}", places * (scale, scale, 1, 1), new * (scale, scale, 1, 1))
-                if not len(new):
-                    break
-                if population is None:
-                    population = Population(float(np.median(new[:, 3])), 2.0)
-                fit = fitted(renderer, sharp if stage == "sharp" else small - background, np.concatenate([places, new]),
-                             weight, population, steps=STEPS)
-                keep, _ = self._stays(renderer, fit, weight, self._small_error)
-                places = self._moved(renderer, fit, keep, Variance(1 / scale**2), valid)[0] if MOVE[0] else fit.places[keep]
-                population = _population(fit, keep, population)
-                image = self._small.image(places, small.shape)
-                if len(new) < 0.05 * len(places):
-                    break
+        for cycle in range(CYCLES):
+            for stage, rounds in (("sharp", 5), ("plain", 3)):
+                renderer = self._sharp if stage == "sharp" else self._small
+                for r in range(rounds):
+                    if stage == "plain":
+                        background = self._small_surface.fit(small - image, weight)
+                    total = self._errors(self._small, places, self._small_error, small.shape)
+                    left = (small - image - background) / np.sqrt(1 + scale**2 * total)
+                    new = self._new(left, population, whiten=stage == "sharp" or WH[0])
+                    self._report(f"{stage}{r}", places * (scale, scale, 1, 1), new * (scale, scale, 1, 1))
+                    if not len(new):
+                        break
+                    if population is None:
+                        population = Population(float(np.median(new[:, 3])), 2.0)
+                    fit = fitted(renderer, sharp if stage == "sharp" else small - background, np.concatenate([places, new]),
+                                 weight, population, steps=STEPS)
+                    keep, _ = self._stays(renderer, fit, weight, self._small_error)
+                    places = self._moved(renderer, fit, keep, Variance(1 / scale**2), valid)[0] if MOVE[0] else fit.places[keep]
+                    population = _population(fit, keep, population)
+                    image = self._small.image(places, small.shape)
+                    if len(new) < 0.05 * len(places):
+                        break
+            if cycle == CYCLES - 1 or not len(places):
+                break
+            odd = self._odd(renderer, fit, keep, weight, self._small_error)
+            if DEBUG: DEBUG(self, f"odd {odd.sum()} ", places * (scale, scale, 1, 1), places[odd]* (scale, scale, 1, 1))
+            if not odd.any():
+                break
+            places = places[~odd]
+            image = self._small.image(places, small.shape)
         places = places * (scale, scale, 1, 1)
         return places, population or Population(1.0, 2.0)
 

@@ -84,6 +84,11 @@ class Fit:
         """Mean square of the residual on each particle's support, over its variance, (P,)."""
         return self._in_order(self._chi2 / np.maximum(np.diff(self._columns.starts), 1))
 
+    def chi2_of(self, residual: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
+        """The same as `chi2`, of another residual and weight."""
+        sums = self._columns.gradient(residual, weight)[1]
+        return self._in_order(sums / np.maximum(np.diff(self._columns.starts), 1))
+
     @property
     def std(self) -> NDArray[np.float64]:
         """Standard deviations of y, x and slice from the inverse of the matrix (the Cramér-Rao bound), (P, 3)."""
