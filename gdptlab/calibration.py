@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Integral
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -28,6 +28,9 @@ from gdptlab.correlation import Correlator, normalised
 from gdptlab.denoising import denoised, noise_level
 from gdptlab.displacement import Displacement
 from gdptlab.files import written_whole
+
+if TYPE_CHECKING:
+    from gdptlab.fit.model import PatternModel
 
 Plan = TypeVar("Plan")
 
@@ -368,6 +371,13 @@ class Calibration:
             off = (made.images - truth).reshape(len(self), -1, 1)
             errors.append(np.concatenate([rows @ off, -np.linalg.pinv(made._columns)[:, 2:3] @ off], axis=1)[..., 0])
         return np.array(errors)
+
+    @cached_property
+    def model(self) -> "PatternModel":
+        """Patterns, and what is known of their errors, as the joint fit takes them."""
+        from gdptlab.fit.model import PatternModel  # the fit's room stands on this module
+
+        return PatternModel.from_calibration(self)
 
     @cached_property
     def expected(self) -> NDArray[np.float32]:

@@ -82,12 +82,16 @@ class Fit:
     @property
     def chi2(self) -> NDArray[np.float64]:
         """Mean square of the residual on each particle's support, over its variance, (P,)."""
-        return self._in_order(self._chi2 / np.maximum(np.diff(self._columns.starts), 1))
+        return self._in_order(self._chi2) / self.area
+
+    @property
+    def area(self) -> NDArray[np.int64]:
+        """Pixels of each particle's support in the frame, 1 or more, (P,)."""
+        return self._in_order(np.maximum(np.diff(self._columns.starts), 1))
 
     def chi2_of(self, residual: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
         """The same as `chi2`, of another residual and weight."""
-        sums = self._columns.gradient(residual, weight)[1]
-        return self._in_order(sums / np.maximum(np.diff(self._columns.starts), 1))
+        return self._in_order(self._columns.gradient(residual, weight)[1]) / self.area
 
     @property
     def std(self) -> NDArray[np.float64]:
