@@ -112,7 +112,7 @@ class Fit:
         """
         amplitude = self.places[self._order, 3]
         precision = np.maximum(1 / self._variances[:, 3] - self.population.precision(amplitude), 1e-12)
-        best = amplitude + self._gradient[:, 3] / precision
+        best = amplitude - self.population.pull(amplitude) / precision  # where likelihood and prior balance
         return self._in_order(amplitude * (2 * best - amplitude) * precision / 2)
 
     @property
