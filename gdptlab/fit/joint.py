@@ -280,14 +280,15 @@ class Joint:
 
     def _search(self, frame: NDArray[np.float32], pixels: Pixels) -> tuple[NDArray[np.float64], Population, int]:
         """Places of particles, to a fraction of a pixel, their population, and which background suits."""
-        search = _Search(self, frame, pixels)
+        search, before = _Search(self, frame, pixels), np.inf
         for cycle in range(CYCLES):
             search.find(self._sharp, ROUNDS)
             search.find(self._small, ROUNDS)
             odd = search.odd()
             self._report(f"odd {odd.sum()}", search.places * (2, 2, 1, 1), search.places[odd] * (2, 2, 1, 1))
-            if cycle == CYCLES - 1 or not odd.any():
+            if cycle == CYCLES - 1 or not 0 < odd.sum() < before:
                 break
+            before = odd.sum()
             search.take_out(odd)
         places = search.places * (self._scale, self._scale, 1, 1)
         return np.pad(places, ((0, 0), (0, self.model.modes_count))), search.population or UNKNOWN, search.surface or 0

@@ -19,6 +19,9 @@ from gdptlab.fit.renderer import Columns, Renderer
 LONGEST_STEP = np.array([1.5, 1.5, 1.5, 0.7])
 """Longest Gauss-Newton step of y, x (px), slice, and amplitude (as a fraction of it)."""
 
+CONVERGED = 0.02
+"""Fraction of the longest step below which a step is the last."""
+
 DAMPING = 1e-3
 """Fraction by which the diagonal is raised (Levenberg)."""
 
@@ -183,7 +186,9 @@ def fitted(
     places, system, residual = places.copy(), None, np.empty_like(frame)
     if surface is None:
         background = np.float32(0)
-    for step in range(steps + 1):
+    step = -1
+    while step < steps:
+        step += 1
         if system is None:
             order = np.argsort(places[:, 1], kind="stable")
         columns = renderer.draw(places[order], frame.shape)
@@ -210,6 +215,9 @@ def fitted(
         places[:, 3] = np.maximum(places[:, 3], FAINTEST)
         if not near:
             system = None
+        if fraction.max(initial=0) < CONVERGED:
+            steps = step + 1
+            near = True
     return Fit(places, frame, residual, image, background, population, order, columns, system, gradient, chi2)
 
 
