@@ -157,7 +157,7 @@ class Joint:
             if not len(new):
                 break
             places = np.concatenate([places, new])
-        fit = self._fitted(frame, places, weight, population, surface, background, 3)
+        fit = self._fitted(frame, places, weight, population, surface, background, STEPS)
         while True:
             total = self._full.error_variance(fit.places, self.shape)
             gain = self._full.gain(fit, weight, total)
@@ -177,7 +177,7 @@ class Joint:
         places = before.places.copy()
         places[:, :3] += before.velocity
         weight = before.variance.weight(before.fit.image, pixels.valid)
-        fit = self._fitted(frame, places, weight, before.population, before.surface, before.fit.background, 2, near=True)
+        fit = self._fitted(frame, places, weight, before.population, before.surface, before.fit.background, STEPS)
         total = self._full.error_variance(fit.places, self.shape)
         gain = self._full.gain(fit, weight, total)
         stays = self._full.staying(gain, fit.places, LEAST_GAIN)
@@ -237,12 +237,11 @@ class Joint:
         surface: int,
         background: NDArray[np.float32] | None,
         steps: int,
-        near: bool = False,
     ) -> Fit:
         """All particles and the background at full resolution."""
         return fitted(
             self._full.renderer, frame, places, weight, population, steps=steps, surface=self._backgrounds[surface],
-            background=background, near=near,
+            background=background,
         )  # fmt: skip
 
     def _reviewed(

@@ -22,6 +22,9 @@ LONGEST_STEP = np.array([1.5, 1.5, 1.5, 0.7])
 CONVERGED = 0.02
 """Fraction of the longest step below which a step is the last."""
 
+LONG = 0.2
+"""Fraction of the longest step from which on a step changes the matrix enough for it to be made again."""
+
 DAMPING = 1e-3
 """Fraction by which the diagonal is raised (Levenberg)."""
 
@@ -160,7 +163,6 @@ def fitted(
     steps: int,
     surface: Background | None = None,
     background: NDArray[np.float32] | None = None,
-    near: bool = False,
 ) -> Fit:
     """Fit particles from where they are about.
 
@@ -175,13 +177,11 @@ def fitted(
     population : Population
         Prior of the amplitude.
     steps : int
-        Gauss-Newton steps.
+        Largest number of Gauss-Newton steps.
     surface : Background, optional
         Fit it as well. Without it the frame has no background.
     background : float32 array (rows, columns), optional
         Background to begin with; without it, the one that fits what the particles leave.
-    near : bool
-        The places are good to a fraction of a pixel already, so that one matrix serves all steps.
     """
     places, system, residual = places.copy(), None, np.empty_like(frame)
     if surface is None:
@@ -213,11 +213,11 @@ def fitted(
         places[order, :4] += change / np.maximum(fraction.max(axis=1, keepdims=True), 1)
         places[:, 2] = np.clip(places[:, 2], 0, renderer.count - 1)
         places[:, 3] = np.maximum(places[:, 3], FAINTEST)
-        if not near:
+        longest = fraction.max(initial=0)
+        if longest > LONG:
             system = None
-        if fraction.max(initial=0) < CONVERGED:
+        if longest < CONVERGED:
             steps = step + 1
-            near = True
     return Fit(places, frame, residual, image, background, population, order, columns, system, gradient, chi2)
 
 
