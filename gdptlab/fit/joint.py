@@ -35,8 +35,11 @@ CYCLES = 4
 ROUNDS = 5
 """Largest number of times that further particles are sought in one search."""
 
-STEPS = 5
-"""Gauss-Newton steps after each round."""
+SEARCH_STEPS, STEPS = 2, 5
+"""Largest numbers of Gauss-Newton steps after each round of the search, and at full resolution."""
+
+REFITS = 6
+"""Largest number of fits at full resolution, each without the particles that added too little in the one before."""
 
 KNOTS = (2.0, 1.0, 0.5)
 """Distances between the knots of the background that are tried, in templates."""
@@ -147,24 +150,19 @@ class Joint:
         places, population, surface = self._search(frame, pixels)
         variance, background = Variance(), None
         weight = variance.weight(np.zeros_like(frame), pixels.valid)
-        for again in (True, True, False):
+        for again in range(REFITS):
             fit = self._fitted(frame, places, weight, population, surface, background, STEPS)
-            stays, population, new = self._reviewed(fit, weight, population, again)
-            variance, background = learned_variance(fit.image, fit.residual, 1.0), fit.background
-            places = self._likelier(fit, variance, pixels)[stays]
-            weight = variance.weight(fit.image, pixels.valid)
-            self._report("full", places, new)
-            if not len(new):
-                break
-            places = np.concatenate([places, new])
-        fit = self._fitted(frame, places, weight, population, surface, background, STEPS)
-        while True:
             total = self._full.error_variance(fit.places, self.shape)
             gain = self._full.gain(fit, weight, total)
             stays = self._full.staying(gain, fit.places, LEAST_GAIN)
-            if stays.all():
+            if again and stays.all():
                 break
-            fit = self._fitted(frame, fit.places[stays], weight, population, surface, fit.background, 2)
+            population, background = learned_population(fit, stays, population), fit.background
+            new = self._unexplained(fit, weight, total, population) if again < 2 else places[:0]
+            variance = learned_variance(fit.image, fit.residual, 1.0)
+            weight = variance.weight(fit.image, pixels.valid)
+            self._report("full", fit.places[stays], new)
+            places = np.concatenate([self._likelier(fit, variance, pixels)[stays], new])
         self._report("end", fit.places, [])
         excess = self._full.excess(fit, weight, total)
         velocity = np.zeros((len(fit.places), 3))
@@ -243,16 +241,6 @@ class Joint:
             self._full.renderer, frame, places, weight, population, steps=steps, surface=self._backgrounds[surface],
             background=background,
         )  # fmt: skip
-
-    def _reviewed(
-        self, fit: Fit, weight: NDArray[np.float32], population: Population, search: bool
-    ) -> tuple[NDArray[np.bool_], Population, NDArray[np.float64]]:
-        """Which particles of a fit stay, their population, and further ones, if they are to be sought."""
-        total = self._full.error_variance(fit.places, self.shape)
-        stays = self._full.staying(self._full.gain(fit, weight, total), fit.places, LEAST_GAIN)
-        population = learned_population(fit, stays, population)
-        new = self._unexplained(fit, weight, total, population) if search else fit.places[:0]
-        return stays, population, new
 
     def _unexplained(
         self, fit: Fit, weight: NDArray[np.float32], total: NDArray[np.float32], population: Population
@@ -388,7 +376,7 @@ class _Search:
         """Fit further particles with the others, and drop those that add too little."""
         population = self.population or Population(float(np.median(new[:, 3])), UNKNOWN.sigma)
         places = np.concatenate([self.places, new])
-        fit = fitted(level.renderer, frame, places, self._weight, population, steps=STEPS)
+        fit = fitted(level.renderer, frame, places, self._weight, population, steps=SEARCH_STEPS)
         total = level.error_variance(fit.places, frame.shape)
         stays = level.staying(level.gain(fit, self._weight, total), fit.places, least)
         self._fit, self._stays, self._total = fit, stays, total

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.stats import median_abs_deviation
+from scipy.stats import norm
 
 from gdptlab.cores import compiled
 from gdptlab.denoising import noise_level
@@ -131,13 +131,11 @@ def learned_variance(image: NDArray[np.float32], residual: NDArray[np.float32], 
 
     The patterns' own errors grow with the square of the image. That term is fitted, too, but left out.
     """
-    image, residual = np.abs(image[::3, ::3]).ravel(), residual[::3, ::3].ravel()  # enough of them
+    image, residual = (np.abs(values[::4, ::4]).ravel() for values in (image, residual))  # enough of them
     rank, dark = np.argsort(image), np.count_nonzero(image == 0)
     # Of few particles, light falls on few pixels.
     parts = [part for part in (rank[:dark], *np.array_split(rank[dark:], BINS - 1)) if len(part) > 50]
-    values = np.array(
-        [(image[part].mean(), median_abs_deviation(residual[part], center=np.median, scale="normal") ** 2) for part in parts]
-    )
+    values = np.array([(image[part].mean(), (np.median(residual[part]) / norm.ppf(0.75)) ** 2) for part in parts])
     if len(values) < 4:
         return Variance(noise**2)
     light, variance = values.T
