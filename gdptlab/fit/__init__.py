@@ -1,13 +1,6 @@
-"""The model of a frame, fitted: all particles and the background at once."""
+"""The model of a frame, fitted: a smooth background plus a sum of particles, all at once."""
 
-import lazy_loader
+from gdptlab.fit.joint import Explained, Joint
+from gdptlab.fit.model import PatternModel
 
-# Each module is imported when one of its names is first used.
-__getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__,
-    submod_attrs={
-        "field_calibration": ["FieldCalibration"],
-        "over_field": ["decided_by_plane", "locate_over_field"],
-        "field_images": ["field_terms"],
-    },
-)
+__all__ = ["Explained", "Joint", "PatternModel"]
