@@ -1,0 +1,158 @@
+"""The pattern model: the image of a particle at any depth and anywhere in the field, and how well it is known.
+
+The image of particle i, at x_i, y_i, z_i with amplitude a_i, is
+
+    a_i [ sum_m phi_m(x_i, y_i) P_m(x - x_i, y - y_i; z_i - f(x_i, y_i)) + sum_k c_ik Q_k(...) ],   phi = 1, x, y, r^2
+
+with patterns P_m, focal surface f, and modes Q_k by which one particle differs from the next; the c_ik are 0 on average
+with standard deviation 1. A calibration of one particle has M = 1, f = 0 and no modes.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter, median_filter
+
+from gdptlab.calibration import Calibration
+from gdptlab.denoising import denoised, noise_level
+
+ERROR_SCALE_PX = 2.0
+"""Scale, in px, on which the error of the patterns is compared with white noise; about the width of their finest
+details, and on this scale a matched filter sums pixels."""
+
+
+def field_terms(x_px: ArrayLike, y_px: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Terms 1, x, y, r^2 of smooth functions over frames of `shape`, (..., 4); each about -1 to 1."""
+    rows, columns = shape
+    half = max(shape) / 2
+    u = (np.asarray(x_px, dtype=float) - (columns - 1) / 2) / half
+    v = (np.asarray(y_px, dtype=float) - (rows - 1) / 2) / half
+    square = ((rows / 2 / half) ** 2 + (columns / 2 / half) ** 2) / 3  # the mean of r^2 over the frame
+    return np.stack([np.ones_like(u), u, v, u**2 + v**2 - square], axis=-1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PatternModel:
+    """Patterns, and what is known of their errors.
+
+    Attributes
+    ----------
+    patterns : float32 array (M, N, m, m)
+        Mean pattern, and what is added to it for each further term of `field_terms`, at N slices, in counts for a
+        particle of amplitude 1; the particle is in the middle, m = 2 h nodes_per_px + 1 for a support of h px to
+        each side. M is 4, or 1: the same everywhere.
+    z_um : float64 array (N,)
+        Depths of the slices, increasing.
+    nodes_per_px : int
+        1 or 2.
+    noise : float
+        Standard deviation of a pixel of the scan without light, counts.
+    size : int
+        Rows and columns (px, odd) that were measured; beyond, the patterns are continued.
+    pattern_error : float32 array (N, m, m)
+        Standard deviation of the mean pattern's error (noise of the scan, difference of its particles that no mode
+        tells) in counts at amplitude 1: that of white noise which is as large as the error on the scale of
+        `ERROR_SCALE_PX` (`error_density`).
+    own_error : float64 array (N, 3)
+        Standard deviation of the error in x, y (px) and z (um) that the patterns' own error makes.
+    own_bias_um : float64 array (N,)
+        Error of z common to all particles at a depth, which is to be taken from a measured z.
+    surface : float64 array (4,)
+        Focal surface in `field_terms`: the slice at which a particle is in focus, less that in the middle.
+    modes : float32 array (K, N, m, m)
+        Ways in which particles differ.
+    """
+
+    patterns: NDArray[np.float32]
+    z_um: NDArray[np.float64]
+    nodes_per_px: int
+    noise: float
+    size: int
+    pattern_error: NDArray[np.float32]
+    own_error: NDArray[np.float64]
+    own_bias_um: NDArray[np.float64]
+    surface: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
+    modes: NDArray[np.float32] | None = None
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration) -> Self:
+        """Model of a calibration with one particle: one pattern, a node per pixel, flat focal surface, no modes."""
+        images = continued(calibration.images)
+        rim = (images.shape[-1] - calibration.size) // 2
+        errors = np.pad(remake_errors(calibration), ((0, 0), (0, 0), (rim, rim), (rim, rim)), mode="edge")
+        return cls(
+            patterns=images[None],
+            z_um=calibration.z_um,
+            nodes_per_px=1,
+            noise=noise_level(calibration.stack),
+            size=calibration.size,
+            pattern_error=error_density(errors, 1),
+            own_error=calibration.own_error,
+            own_bias_um=calibration.own_bias_um,
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of slices N."""
+        return self.patterns.shape[1]
+
+    @property
+    def modes_count(self) -> int:
+        """Number of modes K."""
+        return 0 if self.modes is None else len(self.modes)
+
+    @cached_property
+    def images(self) -> NDArray[np.float32]:
+        """Mean pattern with a node per pixel, (N, n, n), n odd: the particle in the middle."""
+        return np.ascontiguousarray(self.patterns[0, :, :: self.nodes_per_px, :: self.nodes_per_px])
+
+    @cached_property
+    def peak(self) -> NDArray[np.float64]:
+        """Largest deviation of the mean pattern from the background at each slice, counts at amplitude 1, (N,)."""
+        return np.abs(gaussian_filter(self.images, (0, 1, 1))).max(axis=(1, 2)).astype(float)
+
+
+def error_density(errors: NDArray, nodes_per_px: int) -> NDArray[np.float32]:
+    """Standard deviation (N, m, m) of white noise as large as errors (R, N, m, m) are on the scale `ERROR_SCALE_PX`.
+
+    White noise of standard deviation s, smoothed by a Gaussian of width w px, has s / (2 sqrt(pi) w).
+    """
+    width = ERROR_SCALE_PX * nodes_per_px
+    smooth = gaussian_filter(errors, (0, 0, width, width), mode="nearest")
+    variance = gaussian_filter(np.mean(np.square(smooth), axis=0), (2, 2 * width, 2 * width), mode="nearest")
+    return (2 * np.sqrt(np.pi) * ERROR_SCALE_PX * np.sqrt(variance)).astype(np.float32)
+
+
+def remake_errors(calibration: Calibration, repeats: int = 4) -> NDArray[np.float32]:
+    """Errors (R, N, n, n) of the images of calibrations made again, with fresh noise like the stack's."""
+    truth = calibration.images.astype(np.float64)
+    light, rest = np.abs(truth), calibration.stack - denoised(calibration.stack)
+    per_count = max(np.polyfit(light.ravel(), rest.ravel() ** 2, 1)[0], 0)
+    noise = np.sqrt(noise_level(calibration.stack) ** 2 + per_count * light)
+    errors = []
+    for seed in range(repeats):
+        stack = truth + np.random.default_rng(seed).normal(0, noise, truth.shape)
+        errors.append(Calibration.from_stack(stack, calibration.z_um, n_sub=len(calibration.subset)).images - truth)
+    return np.array(errors, dtype=np.float32)
+
+
+def continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Images that go on beyond their frame: the light along each side falls on as a parabola about the middle does."""
+    half = images.shape[1] // 2
+    more, depth = 2 * (half // 3), max(half // 4, 2)
+    away = np.arange(-half - more, half + more + 1)
+    rim, fall = np.abs(away) > half, []
+    for axis in (1, 2):
+        light, factor = images.mean(axis=3 - axis), np.ones((len(images), len(away)), np.float32)
+        for side in (away[more : more + depth], away[-more - depth : -more]):
+            bend, middle = np.polyfit(side**2, light[:, side + half].T, 1)
+            end = np.where(bend * middle < 0, -middle / np.where(bend == 0, 1, bend), 0)
+            end = np.clip(median_filter(end, 5, mode="nearest")[:, None], (half + 1) ** 2, (half + more) ** 2)
+            beyond = rim & (away * side[0] > 0)
+            factor[:, beyond] = np.clip((end - away[beyond] ** 2) / (end - half**2), 0, 1)
+        fall.append(factor)
+    down, across = fall
+    return np.pad(images, ((0, 0), (more, more), (more, more)), mode="edge") * (down[:, :, None] * across[:, None, :])
