@@ -1,0 +1,110 @@
+"""A smooth background: the light of a frame that belongs to no particle."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from gdptlab.cores import compiled
+from gdptlab.fit.renderer import Columns
+
+BOUNDED = 3.0
+"""Residuals beyond so many standard deviations pull no harder than these: light not yet explained is no background."""
+
+EVERY = 3
+"""Rows that are summed for the products of particles and background, both smooth over so many."""
+
+
+class Background:
+    """Cubic spline surface for frames of one shape.
+
+    Parameters
+    ----------
+    shape : (rows, columns)
+    knot_px : float
+        About the distance of its knots, in both directions.
+    """
+
+    def __init__(self, shape: tuple[int, int], knot_px: float) -> None:
+        self._along = [_splines(n, max(round(n / knot_px), 1)) for n in shape]
+        self._pairs = [(b[:, :, None] * b[:, None, :]).reshape(len(b), -1) for b in self._along]
+
+    def fit(self, frame: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Fit a frame from which the particles were taken.
+
+        Parameters
+        ----------
+        frame : float32 array (rows, columns)
+        weight : float32 array (rows, columns)
+            One over the variance of each pixel; 0 where it says nothing of the background.
+
+        Returns
+        -------
+        float32 array (rows, columns)
+        """
+        level = np.median(frame[::4, ::4])
+        frame, surface = frame - level, np.float32(0)
+        for _ in range(2):
+            off = np.abs(frame - surface) * np.sqrt(weight)
+            trust = weight * np.minimum(1, BOUNDED / np.maximum(off, BOUNDED))
+            surface = self.surface(np.linalg.solve(self.matrix(trust), self.gradient(frame, trust)))
+        return level + surface
+
+    def gradient(self, residual: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Right-hand side (B,) of weighted least squares for B coefficients."""
+        down, across = self._along
+        return (down.T @ (residual * weight) @ across).ravel().astype(np.float64)
+
+    def matrix(self, weight: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Matrix (B, B) of weighted least squares."""
+        m, n = (along.shape[1] for along in self._along)
+        matrix = (self._pairs[0].T @ weight @ self._pairs[1]).reshape(m, m, n, n).transpose(0, 2, 1, 3)
+        matrix = matrix.reshape(m * n, m * n).astype(np.float64)
+        # Where the frame says nothing the surface stays small (in `fit`, near the median).
+        matrix[np.diag_indices(m * n)] += 1e-6 * np.trace(matrix) / (m * n)
+        return matrix
+
+    def surface(self, coefficients: NDArray) -> NDArray[np.float32]:
+        """Surface (rows, columns) with coefficients (B,)."""
+        down, across = self._along
+        return down @ coefficients.reshape(down.shape[1], -1).astype(np.float32) @ across.T
+
+    def products(self, columns: Columns, weight: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Weighted products (4 P, B) of the particles' columns with the splines of the surface, to a few per cent."""
+        down, across = self._along
+        out = np.zeros((4 * len(columns.boxes), down.shape[1], across.shape[1]))
+        rows = (np.ascontiguousarray(along.T) for along in (down, across))
+        _products(columns.boxes, columns.starts, columns.values, weight, *rows, out)
+        return out.reshape(len(out), -1)
+
+
+@compiled
+def _products(boxes, starts, values, weight, down, across, out):  # pragma: no cover
+    """`down` (splines, rows) and `across` (splines, columns) as rows, so that the long loops are over pixels."""
+    seen = np.empty(across.shape[1], np.float32)
+    for i in range(len(boxes)):
+        y0, y1, x0, x1 = boxes[i]
+        if y1 <= y0 or x1 <= x0:
+            continue
+        width, first = x1 - x0, y0 + ((y1 - y0) % EVERY != 1)
+        for c in range(4):
+            for r in range(first, y1, EVERY):
+                k = starts[i] + (r - y0) * width
+                each = np.float32(min(r + 2, y1) - max(r - 1, y0))  # it stands for its neighbours, too
+                column, trust = values[c, k:], weight[r, x0:]
+                for q in range(width):
+                    seen[q] = each * column[q] * trust[q]
+                for b in range(len(across)):
+                    if across[b, x0] == 0 and across[b, x1 - 1] == 0:  # few of the splines reach the box
+                        continue
+                    total, spline = np.float32(0), across[b, x0:]
+                    for q in range(width):
+                        total += seen[q] * spline[q]
+                    for a in range(len(down)):
+                        out[4 * i + c, a, b] += down[a, r] * total
+
+
+def _splines(n: int, spans: int) -> NDArray[np.float32]:
+    """Values (n, spans + 3) of cubic B-splines at n pixels."""
+    step = n / spans
+    knots = -0.5 + step * np.arange(-3, spans + 4)
+    return BSpline.design_matrix(np.arange(n), knots, 3).toarray().astype(np.float32)

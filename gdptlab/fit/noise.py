@@ -1,0 +1,146 @@
+"""The noise model: which pixels tell anything, and the variance of those that do.
+
+A pixel's variance is that of read noise, plus photons (a line in the model image), plus the patterns' own error (the
+square of the amplitude times the variance of the pattern). The last is not independent from pixel to pixel: it
+serves to judge candidates and residuals, never to weigh pixels.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.stats import median_abs_deviation
+
+from gdptlab.cores import compiled
+from gdptlab.denoising import noise_level
+
+ALONE = 3.0
+"""A pixel is hot (or dead) if it differs from the median around it by more than so many times what its second most
+different neighbour does. In the narrowest image that can be measured, 2 px wide, it is 2."""
+
+HOT = 8.0
+"""And by more than so many standard deviations of the noise."""
+
+PLATEAU = 4
+"""Fewest pixels at the highest value for it to be the top of the camera's range."""
+
+BINS = 12
+"""Bins of the model image in which the variance of the residual is estimated."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Which pixels of a frame are used.
+
+    Attributes
+    ----------
+    valid : bool array (rows, columns)
+    saturated, defective : int
+        Number of pixels left out: at the top of the camera's range, with their neighbours; hot or dead.
+    noise : float
+        Standard deviation of a pixel without light.
+    filled : float32 array (rows, columns)
+        The frame, pixels that are left out replaced by the median around them.
+    """
+
+    valid: NDArray[np.bool_]
+    saturated: int
+    defective: int
+    noise: float
+    filled: NDArray[np.float32]
+
+
+def usable_pixels(frame: NDArray[np.float32]) -> Pixels:
+    """Find the pixels of a frame (rows, columns) that tell something."""
+    noise = max(noise_level(frame), 1e-5 * float(np.ptp(np.percentile(frame[::4, ::4], (1, 99)))))
+    if not noise > 1e-15:  # a blank frame has none, or one whose square is lost in float32
+        noise = 1.0
+    defective = np.zeros(frame.shape, np.uint8)
+    around = cv2.medianBlur(frame, 5)
+    _defective(frame, around, np.float32(HOT * noise), np.float32(ALONE), defective)
+    usual = frame[defective == 0]
+    top = usual.max(initial=-np.inf)
+    at_top, near_top = np.count_nonzero(usual == top), np.count_nonzero((usual > top - 2 * noise) & (usual < top))
+    saturated = np.zeros(frame.shape, np.uint8)
+    if at_top >= PLATEAU and at_top > near_top and usual.min(initial=top) < top:
+        saturated = cv2.dilate((frame >= top).astype(np.uint8) & ~defective, np.ones((3, 3), np.uint8))
+    valid = (defective | saturated) == 0
+    filled = frame if valid.all() else np.where(defective, around, frame)
+    return Pixels(valid, int(saturated.sum()), int(defective.sum()), noise, filled)
+
+
+@compiled
+def _defective(frame, around, least, alone, out):  # pragma: no cover
+    """Mark pixels that stand alone: all but one of their eight neighbours are far less away from the median."""
+    rows, columns = frame.shape
+    for r in range(rows):
+        for c in range(columns):
+            middle = around[r, c]
+            away = abs(frame[r, c] - middle)
+            if away <= least:
+                continue
+            sign = np.float32(1) if frame[r, c] > middle else np.float32(-1)
+            first = second = np.float32(0)
+            for i in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, columns)):
+                    if i == r and j == c:
+                        continue
+                    other = sign * (frame[i, j] - middle)
+                    if other > first:
+                        first, second = other, first
+                    elif other > second:
+                        second = other
+            if away > least + alone * second:
+                out[r, c] = 1
+
+
+@dataclass(frozen=True)
+class Variance:
+    """Variance of a pixel as a line in the model image.
+
+    Attributes
+    ----------
+    level : float
+        Of read noise.
+    slope : float
+        Of photon noise: counts squared per count of light.
+    """
+
+    level: float = 1.0
+    slope: float = 0.0
+
+    def weight(self, image: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """One over the variance of each pixel; 0 where it is left out."""
+        weight = np.empty_like(image)
+        _fill_weight(image, np.float32(self.level), np.float32(self.slope), valid, weight)
+        return weight
+
+
+def learned_variance(image: NDArray[np.float32], residual: NDArray[np.float32], noise: float) -> Variance:
+    """Variance as a line in the model image, from the residual, robustly.
+
+    The patterns' own errors grow with the square of the image. That term is fitted, too, but left out.
+    """
+    image, residual = np.abs(image[::3, ::3]).ravel(), residual[::3, ::3].ravel()  # enough of them
+    rank, dark = np.argsort(image), np.count_nonzero(image == 0)
+    # Of few particles, light falls on few pixels.
+    parts = [part for part in (rank[:dark], *np.array_split(rank[dark:], BINS - 1)) if len(part) > 50]
+    values = np.array(
+        [(image[part].mean(), median_abs_deviation(residual[part], center=np.median, scale="normal") ** 2) for part in parts]
+    )
+    if len(values) < 4:
+        return Variance(noise**2)
+    light, variance = values.T
+    sure, brightest = 1 / np.maximum(variance, 0.25 * noise**2), max(light.max(), 1e-9)
+    terms = (light[:, None] / brightest) ** np.arange(3)
+    level, linear, _ = nnls(terms * sure[:, None], variance * sure)[0]
+    return Variance(max(level, 0.25 * noise**2), linear / brightest)
+
+
+@compiled
+def _fill_weight(image, level, slope, valid, weight):  # pragma: no cover
+    for r in range(image.shape[0]):
+        for c in range(image.shape[1]):
+            weight[r, c] = valid[r, c] / (slope * abs(image[r, c]) + level)
