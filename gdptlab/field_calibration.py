@@ -29,6 +29,7 @@ from gdptlab.check import real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.denoising import noise_level
 from gdptlab.field_images import FINE, FieldImages, field_terms
+from gdptlab.fit.pattern import particle_light
 from gdptlab.particle_images import Columns
 
 STANDS_OUT = 20.0
@@ -176,7 +177,7 @@ class FieldCalibration:
     def from_one(cls, calibration: Calibration) -> Self:
         """Of a calibration with one particle: the same pattern everywhere, a flat focal surface."""
         checked(calibration)
-        images = calibration.images
+        images = particle_light(calibration)
         m = FINE * (calibration.size - 1) + 1
         fine = np.stack([cv2.resize(image, None, fx=FINE, fy=FINE, interpolation=cv2.INTER_CUBIC) for image in images])
         # `resize` keeps the corners of the pixels, we the centres: half a node.
@@ -195,7 +196,7 @@ class FieldCalibration:
             float(peak.argmax()),
             noise_level(calibration.stack),
             np.zeros((0, *fine.shape), np.float32),
-            calibration.own_error[:, 2],
+            calibration.model.own_error[:, 2],
             beads,
         )
 

@@ -88,7 +88,7 @@ def locate(
         A row for each particle, highest C_m first. `x_px` to the right and `y_px` down, the first pixel's
         centre at (0, 0); `z_um` in the depths of the calibration; `cm`, the correlation with the best image;
         `at_end`, whether that is the stack's first or last image, so that z may lie beyond it. With
-        "joint" `z_um` is less `Calibration.own_bias_um`, and there are also `x_std_px`, `y_std_px` and `z_std_um`,
+        "joint" `z_um` is less `fit.bounds.own_bias_um`, and there are also `x_std_px`, `y_std_px` and `z_std_um`,
         standard deviations (noise of the frame and of the calibration, neighbours considered; wider for a
         particle unlike the others in brightness); `brightness`, 1 for that of the calibration's particle; and
         `chi2`, the mean square of what is left around the particle, in units of the noise: well above 1 for
@@ -175,13 +175,13 @@ def _overlapping(
     fit = explained.fit
     y, x, step, brightness = fit.places.T
     z_um = calibration.z_um
-    table = _table(fit.places[:, :2], step, fit.cm, np.clip(z_um - calibration.own_bias_um, z_um[0], z_um[-1]))
+    table = _table(fit.places[:, :2], step, fit.cm, np.clip(z_um - calibration.model.own_bias_um, z_um[0], z_um[-1]))
     steps = np.arange(len(calibration))
     y_std, x_std, step_std = fit.std.T
     stds = x_std, y_std, step_std * np.interp(step, steps, np.gradient(z_um))
     odd = (brightness - explained.brightness) / explained.spread
     misfit = np.sqrt(1 + CORRELATED * np.maximum(fit.chi2 - 1, 0) + (odd / ODD) ** 2)
-    for name, noise, own in zip(STD_COLUMNS, stds, calibration.own_error.T, strict=True):
+    for name, noise, own in zip(STD_COLUMNS, stds, calibration.model.own_error.T, strict=True):
         table[name] = misfit * np.hypot(noise, np.interp(step, steps, own))
     inside = explained.stays & (y >= -0.5) & (y < image.shape[0] - 0.5) & (x >= -0.5) & (x < image.shape[1] - 0.5)
     table["brightness"], table["chi2"] = brightness, fit.chi2

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 from scipy.optimize import nnls
 
 from gdptlab.background import Background
 from gdptlab.calibration import Calibration
 from gdptlab.cores import compiled
 from gdptlab.denoising import noise_level
+from gdptlab.fit.pattern import continued, particle_light
 from gdptlab.joint_fit import JointFit, fitted
 from gdptlab.matched_filter import MatchedFilter
 from gdptlab.particle_images import ParticleImages
@@ -105,7 +105,7 @@ class Overlap:
     """
 
     def __init__(self, calibration: Calibration, shape: tuple[int, int]) -> None:
-        images, noise = _continued(calibration.images), noise_level(calibration.stack)
+        images, noise = continued(particle_light(calibration)), noise_level(calibration.stack)
         self._size, self._scale = calibration.size, 2 if calibration.half_resolution else 1
         self._shapes, self._surface = ParticleImages(images, noise), Background(shape, 2 * self._size)
         searched, small = calibration.at_search_resolution(images), tuple(-(-n // self._scale) for n in shape)
@@ -278,25 +278,6 @@ class Overlap:
         places = fit.places[np.abs(np.log(fit.places[:, 3] / brightness)) < np.log(2)]
         places[:, 3] = brightness
         return places, brightness
-
-
-def _continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Images that go on beyond their frame: the light along each side falls on as a parabola about the middle does."""
-    half = images.shape[1] // 2
-    more, depth = 2 * (half // 3), max(half // 4, 2)
-    away = np.arange(-half - more, half + more + 1)
-    rim, fall = np.abs(away) > half, []
-    for axis in (1, 2):
-        light, factor = images.mean(axis=3 - axis), np.ones((len(images), len(away)), np.float32)
-        for side in (away[more : more + depth], away[-more - depth : -more]):
-            bend, middle = np.polyfit(side**2, light[:, side + half].T, 1)
-            end = np.where(bend * middle < 0, -middle / np.where(bend == 0, 1, bend), 0)
-            end = np.clip(median_filter(end, 5, mode="nearest")[:, None], (half + 1) ** 2, (half + more) ** 2)
-            beyond = rim & (away * side[0] > 0)
-            factor[:, beyond] = np.clip((end - away[beyond] ** 2) / (end - half**2), 0, 1)
-        fall.append(factor)
-    down, across = fall
-    return np.pad(images, ((0, 0), (more, more), (more, more)), mode="edge") * (down[:, :, None] * across[:, None, :])
 
 
 def _high_passed(images: NDArray, blur: float) -> NDArray[np.float32]:

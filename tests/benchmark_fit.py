@@ -326,7 +326,9 @@ def from_truth(frame: NDArray, calibration: Calibration, truth: pd.DataFrame) ->
         weight = _weight(fit.light, _variance(fit.light, fit.residual, 38.0))
     y, x, step, amplitude = places.T
     steps, z_um = np.arange(len(calibration)), calibration.z_um
-    own = [np.interp(step, steps, values) for values in (calibration.own_error[:, 2], calibration.own_bias_um)]
+    own = [
+        np.interp(step, steps, values) for values in (calibration.model.own_error[:, 2], calibration.model.own_bias_um)
+    ]
     z_std = np.hypot(fit.std[:, 2] * np.interp(step, steps, np.gradient(z_um)), own[0])
     return pd.DataFrame(
         {"x_px": x, "y_px": y, "z_um": np.interp(step, steps, z_um) - own[1], "z_std_um": z_std, "amplitude": amplitude}

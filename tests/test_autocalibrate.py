@@ -54,7 +54,7 @@ def test_only_beads_alone_are_used(made) -> None:
 
 def test_average_has_less_noise_than_a_bead(scan, made) -> None:
     one = Calibration.from_scan(scan, Z_UM, *PLACES[0], size=made.calibration.size)
-    assert made.calibration.own_error[:, 2].mean() < 0.75 * one.own_error[:, 2].mean()
+    assert made.calibration.model.own_error[:, 2].mean() < 0.75 * one.model.own_error[:, 2].mean()
 
 
 def test_what_is_given_is_used(scan) -> None:

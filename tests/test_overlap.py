@@ -12,7 +12,7 @@ from gdptlab import Calibration, batch, locate, match
 from gdptlab.assess import scores
 from gdptlab.film import Film
 from gdptlab.imagetypes import Camera
-from gdptlab.overlap import STAGES, Overlap, _brightness, _continued, _high_passed, _variance, _weight
+from gdptlab.overlap import STAGES, Overlap, _brightness, _high_passed, _variance, _weight
 
 ERRORS, STD = ["dx_px", "dy_px", "dz_um"], ["x_std_px", "y_std_px", "z_std_um"]
 # 50 and 150 in 512 by 512 px.
@@ -307,7 +307,7 @@ def test_depths_are_less_the_bias_of_the_calibration(microscope):
         pairs = match(found, true)
         rows, error = found.loc[pairs["measured"]], pairs["dz_um"].to_numpy()
         without.append(error / rows["z_std_um"].to_numpy())
-        with_it.append((error + np.interp(rows["z_um"], Z_UM, made.own_bias_um)) / rows["z_std_um"].to_numpy())
+        with_it.append((error + np.interp(rows["z_um"], Z_UM, made.model.own_bias_um)) / rows["z_std_um"].to_numpy())
     assert np.square(np.concatenate(without)).mean() < np.square(np.concatenate(with_it)).mean()
 
 
@@ -363,25 +363,6 @@ def test_brightness_of_many_and_few():
     assert _brightness(places[:0], 1.0, 0.5) == (1.0, 0.5)
     alike = np.ones((100, 4))
     assert _brightness(alike[:1], 1.0, 0.5)[1] > _brightness(alike, 1.0, 0.5)[1] > 0
-
-
-def test_images_go_on_beyond_their_frame(calibration):
-    images = _continued(calibration.images)
-    more = (images.shape[1] - SIZE_PX) // 2
-    assert more > 0 and images.shape[1] % 2 == 1
-    np.testing.assert_array_equal(images[:, more:-more, more:-more], calibration.images)
-    rim = images.copy()
-    rim[:, 1:-1, 1:-1] = 0
-    assert np.abs(rim).max() < np.abs(calibration.images[:, [0, -1]]).max() / 2
-
-
-def test_light_beyond_the_frame_is_about_what_was_cut_off(microscope):
-    """At the far end a tenth of a particle's light falls outside of a template."""
-    whole = np.stack([microscope.light(table(60, 60, z), (121, 121)) for z in Z_UM]).astype(np.float32)
-    images = _continued(whole[:, 30:-30, 30:-30])
-    total, cut, drawn = (a.sum(axis=(1, 2)) for a in (whole, whole[:, 30:-30, 30:-30], images))
-    assert (total / cut)[-1] > 1.1
-    np.testing.assert_allclose(drawn / total, 1, atol=0.02)
 
 
 def test_high_pass_takes_out_what_is_smooth():

@@ -28,7 +28,7 @@ LEAST_NOISE = 1e-9
 """Least standard deviation of a pixel, counts: a stack may have been computed without noise."""
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def recalibration_errors(calibration: Calibration) -> NDArray[np.float32]:
     """Errors (REPEATS, N, n, n) of the light of calibrations made of this one's light with fresh noise.
 
