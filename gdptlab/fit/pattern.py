@@ -63,25 +63,28 @@ def _bilinear(y: NDArray, x: NDArray) -> NDArray[np.float64]:
     return np.stack([np.ones(x.shape), x, y, x * y], axis=-1)
 
 
-def continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
+def continued(images: NDArray[np.float32], mean: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
     """Images that go on beyond their frame: the light along each side falls on as a parabola about the middle does.
 
     Parameters
     ----------
-    images : array (N, n, n)
+    images : array (..., N, n, n)
         The particle in the middle, without background.
+    mean : array (N, n, n), optional
+        Images whose light says how that of all falls; `images` themselves, (N, n, n) then, if not given.
 
     Returns
     -------
-    float32 array (N, m, m)
+    float32 array (..., N, m, m)
         m is about 5 n / 3.
     """
-    half = images.shape[1] // 2
+    mean = images if mean is None else mean
+    half = mean.shape[1] // 2
     more, depth = 2 * (half // 3), max(half // 4, 2)
     away = np.arange(-half - more, half + more + 1)
     rim, fall = np.abs(away) > half, []
     for axis in (1, 2):
-        light, factor = images.mean(axis=3 - axis), np.ones((len(images), len(away)), np.float32)
+        light, factor = mean.mean(axis=3 - axis), np.ones((len(mean), len(away)), np.float32)
         for side in (away[more : more + depth], away[-more - depth : -more]):
             bend, middle = np.polyfit(side**2, light[:, side + half].T, 1)
             end = np.where(bend * middle < 0, -middle / np.where(bend == 0, 1, bend), 0)
@@ -90,4 +93,5 @@ def continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
             factor[:, beyond] = np.clip((end - away[beyond] ** 2) / (end - half**2), 0, 1)
         fall.append(factor)
     down, across = fall
-    return np.pad(images, ((0, 0), (more, more), (more, more)), mode="edge") * (down[:, :, None] * across[:, None, :])
+    around = [(0, 0)] * (images.ndim - 2) + [(more, more)] * 2
+    return np.pad(images, around, mode="edge") * (down[:, :, None] * across[:, None, :])
