@@ -252,8 +252,8 @@ class Calibration:
 
     @cached_property
     def model(self) -> "PatternModel":
-        """What the joint fit draws particles with, and what is known of its errors."""
-        from gdptlab.fit.model import PatternModel
+        """Patterns, and what is known of their errors, as the joint fit takes them."""
+        from gdptlab.fit.model import PatternModel  # the fit's room stands on this module
 
         return PatternModel.from_calibration(self)
 

@@ -19,6 +19,7 @@ template wide. Or jointly (`overlap`): particles may overlap and be cut by the f
 
 from collections.abc import Container, Iterable, Iterator
 from itertools import count, islice
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -31,22 +32,13 @@ from gdptlab.calibration import Calibration, checked
 from gdptlab.check import choice, flag, positive, real_array, whole
 from gdptlab.cores import on_one_core
 from gdptlab.images import Images
-from gdptlab.overlap import Explained, Overlap
 from gdptlab.peaks import peaks, strongest
+
+if TYPE_CHECKING:
+    from gdptlab.fit import Explained, Joint
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns, and their types."""
-
-STD_COLUMNS = ("x_std_px", "y_std_px", "z_std_um")
-"""More of them, if particles are fitted jointly."""
-
-CORRELATED = 5.0
-"""Pixels over which what a joint fit leaves of a particle is alike, about, where it is more than noise: an excess of
-chi2 by 0.1 adds 0.5 times the variance. Found as what makes errors of particles in a crowd agree with their std."""
-
-ODD = 3.0
-"""Standard deviations by which a particle is brighter or fainter than the others where its variance is twice the usual:
-it may not be alone."""
 
 METHODS = ("correlation", "joint")
 """How `locate` can work."""
@@ -88,7 +80,7 @@ def locate(
         A row for each particle, highest C_m first. `x_px` to the right and `y_px` down, the first pixel's
         centre at (0, 0); `z_um` in the depths of the calibration; `cm`, the correlation with the best image;
         `at_end`, whether that is the stack's first or last image, so that z may lie beyond it. With
-        "joint" `z_um` is less `fit.bounds.own_bias_um`, and there are also `x_std_px`, `y_std_px` and `z_std_um`,
+        "joint" `z_um` is less `Calibration.own_bias_um`, and there are also `x_std_px`, `y_std_px` and `z_std_um`,
         standard deviations (noise of the frame and of the calibration, neighbours considered; wider for a
         particle unlike the others in brightness); `brightness`, 1 for that of the calibration's particle; and
         `chi2`, the mean square of what is left around the particle, in units of the noise: well above 1 for
@@ -112,7 +104,7 @@ def locate(
     if choice("method", method, METHODS) == "joint":
         if positive("threshold", threshold) != 0.5 or not flag("refine", refine) or min_distance_px is not None:
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
-        return _overlapping(image, calibration, None)[0]
+        return _jointly(image, calibration, None)[0]
     image, distance = _checked(image, calibration, threshold, min_distance_px)
     place, step, cm = _candidates(image, calibration, threshold)
     if flag("refine", refine):
@@ -162,31 +154,23 @@ def _table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.Data
     )
 
 
-def _overlapping(
-    image: ArrayLike, calibration: Calibration, before: Explained | None
-) -> tuple[pd.DataFrame, Explained]:
+def _jointly(
+    image: ArrayLike, calibration: Calibration, before: "Explained | None"
+) -> tuple[pd.DataFrame, "Explained"]:
     """Table of a frame by the joint fit, and where the next frame may begin."""
     image = _image(image, calibration)
-    plan = calibration.plan(Overlap, image.shape)
+    plan = calibration.plan(_joint, image.shape)
     if before is None or before.fit.residual.shape != image.shape:
         explained = plan.first(image)
     else:
         explained = plan.following(image, before)
-    fit = explained.fit
-    y, x, step, brightness = fit.places.T
-    z_um = calibration.z_um
-    table = _table(fit.places[:, :2], step, fit.cm, np.clip(z_um - calibration.model.own_bias_um, z_um[0], z_um[-1]))
-    steps = np.arange(len(calibration))
-    y_std, x_std, step_std = fit.std.T
-    stds = x_std, y_std, step_std * np.interp(step, steps, np.gradient(z_um))
-    odd = (brightness - explained.brightness) / explained.spread
-    misfit = np.sqrt(1 + CORRELATED * np.maximum(fit.chi2 - 1, 0) + (odd / ODD) ** 2)
-    for name, noise, own in zip(STD_COLUMNS, stds, calibration.model.own_error.T, strict=True):
-        table[name] = misfit * np.hypot(noise, np.interp(step, steps, own))
-    inside = explained.stays & (y >= -0.5) & (y < image.shape[0] - 0.5) & (x >= -0.5) & (x < image.shape[1] - 0.5)
-    table["brightness"], table["chi2"] = brightness, fit.chi2
-    order = np.argsort(-table["cm"].to_numpy(), kind="stable")
-    return table.iloc[order[inside[order]]].reset_index(drop=True), explained
+    return plan.table(explained), explained
+
+
+def _joint(calibration: Calibration, shape: tuple[int, int]) -> "Joint":
+    from gdptlab.fit import Joint  # the fit's room stands on this module
+
+    return Joint(calibration.model, shape)
 
 
 def _candidates(
@@ -324,7 +308,7 @@ def in_blocks(
         for first, block in _blocks(frames, ()):
             tables = []
             for frame in block:
-                table, before = on_one_core(_overlapping)(frame, calibration, before)
+                table, before = on_one_core(_jointly)(frame, calibration, before)
                 tables.append(table)
             if first not in done:
                 yield first, len(tables), _numbered(tables, first)

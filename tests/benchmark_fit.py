@@ -26,12 +26,18 @@ from scipy.interpolate import RectBivariateSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
-from gdptlab import Calibration, datasets, locate, match
-from gdptlab.field_calibration import FieldCalibration
+from gdptlab import Calibration, datasets, match
+from gdptlab.autocalibrate import _size as scan_size
+from gdptlab.autocalibrate import find_beads
+from gdptlab.fit import Joint, PatternModel
+from gdptlab.fit.background import Background
+from gdptlab.fit.learning import learned
+from gdptlab.fit.model import field_terms
+from gdptlab.fit.noise import learned_variance
+from gdptlab.fit.renderer import Renderer
+from gdptlab.fit.solver import Population, fitted
 from gdptlab.imagetypes import Camera, as_image_type
 from gdptlab.optics import Microscope, _library
-from gdptlab.over_field import decided_by_plane, locate_over_field
-from gdptlab.overlap import Overlap, _variance, _weight
 
 MICROSCOPE, CAMERA = Microscope(), Camera()
 SHAPE, Z_UM, SIZE_PX = (512, 512), np.linspace(-50, 50, 51), 63
@@ -314,50 +320,55 @@ class Method:
     measure: Callable[[NDArray, object, pd.DataFrame], pd.DataFrame]
 
 
-def from_truth(frame: NDArray, calibration: Calibration, truth: pd.DataFrame) -> pd.DataFrame:
+def model_of_stack(stack: NDArray, z_um: NDArray) -> PatternModel:
+    """Model of one particle."""
+    return Calibration.from_stack(stack, z_um).model
+
+
+def model_of_scan(scan: NDArray, z_um: NDArray) -> PatternModel:
+    """Model of all beads of a scan, found in it."""
+    beads = find_beads(scan, z_um)
+    return learned(scan, z_um, beads[["x_px", "y_px"]].to_numpy(), scan_size(scan, beads))[0]
+
+
+def joint(frame: NDArray, model: PatternModel, _: pd.DataFrame) -> pd.DataFrame:
+    """Table by the joint fit."""
+    plan = Joint(model, frame.shape)
+    return plan.table(plan.first(frame.astype(np.float32)))
+
+
+def from_truth(frame: NDArray, model: PatternModel, truth: pd.DataFrame) -> pd.DataFrame:
     """Table of the fit of all particles, of free amplitude, that starts where they are: what the images allow."""
-    frame, plan = frame.astype(np.float32), Overlap(calibration, frame.shape)
-    step = np.interp(truth["z_um"], calibration.z_um, np.arange(len(calibration)))
+    slices, z_um = np.arange(model.count), model.z_um
+    height = field_terms(truth["x_px"], truth["y_px"], frame.shape) @ model.surface
+    step = np.interp(truth["z_um"], z_um, slices) + height
     places = np.stack([truth["y_px"], truth["x_px"], step, truth["amplitude"]], axis=1)
-    weight, behind = np.full(frame.shape, 38.0**-2, np.float32), None
+    renderer = Renderer(model.patterns, model.nodes_per_px, noise=model.noise, surface=model.surface)
+    weight, frame = np.full(frame.shape, model.noise**-2, np.float32), frame.astype(np.float32)
+    background, population = Background(frame.shape, model.size), Population(1.0, 10.0)
     for _ in range(3):
-        fit = plan._fitted(frame, places, weight, 1.0, 1e3, behind, 3)
-        places, behind = fit.places, fit.behind
-        weight = _weight(fit.light, _variance(fit.light, fit.residual, 38.0))
-    y, x, step, amplitude = places.T
-    steps, z_um = np.arange(len(calibration)), calibration.z_um
-    own = [
-        np.interp(step, steps, values) for values in (calibration.model.own_error[:, 2], calibration.model.own_bias_um)
-    ]
-    z_std = np.hypot(fit.std[:, 2] * np.interp(step, steps, np.gradient(z_um)), own[0])
+        fit = fitted(renderer, frame, places, weight, population=population, steps=3, surface=background)
+        places = fit.places
+        variance = learned_variance(fit.image, fit.residual, model.noise)
+        weight = variance.weight(fit.image, np.ones(frame.shape, bool))
+    y, x, step, amplitude = places.T[:4]
+    step = step - height
+    own = [np.interp(step, slices, values) for values in (model.own_error[:, 2], model.own_bias_um)]
+    z_std = np.hypot(fit.std[:, 2] * (z_um[1] - z_um[0]), own[0])
     return pd.DataFrame(
-        {"x_px": x, "y_px": y, "z_um": np.interp(step, steps, z_um) - own[1], "z_std_um": z_std, "amplitude": amplitude}
+        {
+            "x_px": x,
+            "y_px": y,
+            "z_um": np.interp(step, slices, z_um) - own[1],
+            "z_std_um": z_std,
+            "amplitude": amplitude,
+        }
     )
 
 
-def over_field(frame: NDArray, calibration: FieldCalibration, _: pd.DataFrame) -> pd.DataFrame:
-    """Table by `locate_over_field`."""
-    return locate_over_field(frame, calibration)
-
-
-def joint(frame: NDArray, calibration: Calibration, _: pd.DataFrame) -> pd.DataFrame:
-    """Table by `locate`."""
-    return locate(frame, calibration, method="joint")
-
-
-def of_scan(scan: NDArray, z_um: NDArray) -> FieldCalibration:
-    """Calibration with a scan of these frames."""
-    return FieldCalibration.from_scan(scan, z_um, reach_px=SIZE_PX // 2)
-
-
-def _one_over_field(stack: NDArray, z_um: NDArray) -> FieldCalibration:
-    return FieldCalibration.from_one(Calibration.from_stack(stack, z_um))
-
-
 METHODS = {
-    "joint": Method(Calibration.from_stack, of_scan, joint),
-    "over_field": Method(_one_over_field, of_scan, over_field),
-    "truth": Method(Calibration.from_stack, of_scan, from_truth),
+    "joint": Method(model_of_stack, model_of_scan, joint),
+    "truth": Method(model_of_stack, model_of_scan, from_truth),
 }
 """Ways to measure, by name."""
 
@@ -433,10 +444,10 @@ def _figure(name: str, value: float, target: float, reached: bool, digits: int) 
     return f"{name} {value:.{digits}f}{' ' if reached else '*'}[{target:g}]"
 
 
-def planar_beads(method: Method, learn: Callable[[NDArray, NDArray], object]) -> str:
+def planar_beads(method: Method) -> str:
     """Found, scatter about each frame's own plane, error over standard deviation, and rows that are no listed bead."""
     beads = datasets.planar_beads()
-    calibration, pairs, rows, seconds = learn(beads.scan, beads.z_um), [], 0, []
+    calibration, pairs, rows, seconds = method.of_scan(beads.scan, beads.z_um), [], 0, []
     for k, frame in enumerate(beads.frames):
         truth = beads.truth[beads.truth["frame"] == k].drop(columns="frame")
         start = time.perf_counter()
@@ -476,9 +487,7 @@ def main() -> None:
     for name in options.rows or [*ROWS, "planar"]:
         method = METHODS[options.method]
         if name == "planar":
-            decided = Method(method.of_stack, method.of_scan, lambda *a: decided_by_plane(locate_over_field(*a[:2])))
-            for each, way in (("images alone", METHODS["over_field"]), ("plane declared", decided)):
-                print(each, planar_beads(way, FieldCalibration.from_scan), flush=True)
+            print(planar_beads(method), flush=True)
             continue
         row = ROWS[name]
         for n, target in row.targets.items():

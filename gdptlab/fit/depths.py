@@ -1,7 +1,7 @@
 """Other depths at which a particle might be: each tried alone, all other particles as they are.
 
-The joint fit climbs to the nearest depth only. Here each particle is taken out of the model and tried at every few
-slices of the stack; from the best of them it climbs, its modes free, and the likelihoods are compared.
+The joint fit climbs to the nearest depth only. Here each particle is taken out of the model and climbs from
+other depths, its modes free; the likelihoods are compared.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ LONGEST = np.array([1.0, 1.0, 3.0, 0.5])
 CLIMB = 4
 """Steps of such a fit."""
 
-DEPTHS = 13
-"""About as many depths are tried."""
+APART = 3.0
+"""Slices: depths nearer than this are one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +40,12 @@ class Trials:
     places: NDArray[np.float64]
     gain: NDArray[np.float64]
     matrix: NDArray[np.float64]
+
+    def variance_of_modes(self) -> NDArray[np.float64]:
+        """What the modes' being unknown adds to the variance of y, x and slice, (n, 3)."""
+        with_modes, without = (np.linalg.inv(m) for m in (self.matrix, self.matrix[:, :4, :4]))
+        added = np.diagonal(with_modes, axis1=1, axis2=2)[:, :3] - np.diagonal(without, axis1=1, axis2=2)[:, :3]
+        return np.maximum(added, 0)
 
 
 class Alone:
@@ -73,23 +79,23 @@ class Alone:
         matrix, _, gain = self._evaluated(trials, owner)
         return Trials(trials, gain - population.penalty(trials[:, 3]), matrix)
 
-    def best_elsewhere(self, owner: NDArray[np.int64], apart: float) -> Trials:
-        """The best fit of each particle `owner` (n,) at a depth that is `apart` slices or more from its own."""
-        places = self._fit.places[owner]
-        depths = np.arange(0, self._renderer.count, max(self._renderer.count // DEPTHS, 1))
-        trials = np.repeat(places, len(depths), axis=0)
-        trials[:, 2] = np.tile(depths, len(places))
-        matrix, right, gain = self._evaluated(trials, np.repeat(owner, len(depths)))
-        curvature = matrix[:, 3, 3]
-        amplitude = np.maximum(trials[:, 3] + right[:, 3] / curvature, FAINTEST)
-        # A parabola in the amplitude, and what the prior says of its top.
-        change = amplitude - trials[:, 3]
-        gain = gain + change * right[:, 3] - change**2 * curvature / 2 - self._fit.population.penalty(amplitude)
-        trials[:, 3] = amplitude
-        gain = gain.reshape(len(places), -1)
-        gain[np.abs(depths - places[:, 2:3]) < apart] = -np.inf
-        best = np.arange(len(places)) * len(depths) + gain.argmax(axis=1)
-        return self.climbed(trials[best], owner)
+    def best(self, slices: NDArray[np.float64]) -> Trials:
+        """The best fit of each particle at other depths: starts at `slices` (P, S), NaN: none.
+
+        A particle that climbs back to its own depth has no other; its gain is minus infinity.
+        """
+        places = self._fit.places
+        owner, start = np.nonzero(np.isfinite(slices))
+        trials = places[owner]
+        trials[:, 2] = slices[owner, start]
+        trials = self.climbed(trials, owner)
+        gain = np.where(np.abs(trials.places[:, 2] - places[owner, 2]) < APART, -np.inf, trials.gain)
+        out = Trials(places.copy(), np.full(len(places), -np.inf), np.zeros((len(places), *trials.matrix.shape[1:])))
+        order = np.argsort(gain, kind="stable")  # the best of each particle comes last, and stays
+        for name in ("places", "matrix"):
+            getattr(out, name)[owner[order]] = getattr(trials, name)[order]
+        out.gain[owner[order]] = gain[order]
+        return out
 
     def _evaluated(
         self, trials: NDArray[np.float64], owner: NDArray[np.int64]

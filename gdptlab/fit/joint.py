@@ -1,4 +1,11 @@
-"""A frame explained: particles found, bright ones first, and fitted all at once with the background."""
+"""A frame, or a film, explained: particles found, bright ones first, and fitted all at once with the background.
+
+Particles are found, some at a time, by a matched filter in what the others leave, and after each time all are fitted
+together. While much is unexplained, frame and patterns are high-pass filtered: neighbours not found yet are smooth
+there, and do not pull. A particle stays while it adds to the likelihood beside the others; where the residual is more
+than noise, particles are taken out and sought once more. In a film the particles of one frame, moved on, are where
+the next begins.
+"""
 
 from dataclasses import dataclass
 
@@ -7,241 +14,419 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab.fit.background import Background
-from gdptlab.fit.depths import Alone
+from gdptlab.fit.background import Background, suitable
+from gdptlab.fit.depths import Alone, Trials
+from gdptlab.fit.judgement import LEAST_GAIN, Level, learned_population
 from gdptlab.fit.model import PatternModel, field_terms
 from gdptlab.fit.noise import Pixels, Variance, learned_variance, usable_pixels
-from gdptlab.fit.renderer import Renderer, draw_error, energy_beside_errors
+from gdptlab.fit.renderer import Renderer
 from gdptlab.fit.search import MatchedFilter
 from gdptlab.fit.solver import Fit, Population, fitted
 
-LEAST_GAIN = 20.0
-LOSSLESS = 0.98
-DEBUG = None
-ODD = 1.5
+BLUR = 1 / 20
+"""Width of the Gaussian, as a fraction of a template, beyond which the high-pass filter of the search lets nothing."""
+
 SHARP_GAIN = 2.0
+"""Log-likelihood that a particle must add in high-passed frames: little, as wide images have little to show there."""
+
 CYCLES = 4
-MOVE = [True, False]
-WH = [True,True]
-APART = 3.0
+"""Largest number of searches, each without what was odd after the one before."""
+
+ROUNDS = 5
+"""Largest number of times that further particles are sought in one search."""
+
 STEPS = 5
+"""Gauss-Newton steps after each round."""
+
+KNOTS = (2.0, 1.0, 0.5)
+"""Distances between the knots of the background that are tried, in templates."""
+
+ASTRAY = np.array([-4.0, 0.0, 4.0])
+"""Slices by which the depth on the other side of focus may be off the one that looks most alike."""
+
+AMBIGUOUS = 20.0
+"""Log-likelihood by which one depth must be better than the other to be believed. The patterns' own errors are
+alike in neighbouring pixels, which the likelihood does not know: it would ask for 3."""
+
+CORRELATED = 5.0
+"""Pixels over which what a fit leaves of a particle is alike, about, where it is more than noise: an excess of
+chi-square by 0.1 adds 0.5 times the variance. Found as what makes errors of particles in a crowd agree with their
+standard deviation."""
+
+UNUSUAL = 3.0
+"""Standard deviations by which a particle's amplitude differs from the others' where its variance is twice the usual:
+it may not be alone."""
+
+LOST = 0.2
+"""Fraction of a frame's particles that may be gone in the next (or two of them); if more are, the search begins anew."""
+
+UNKNOWN = Population(1.0, 2.0)
+"""Distribution of the amplitudes where nothing was found."""
+
+DEBUG = None
+EXTRA = False
 
 
 @dataclass(frozen=True, eq=False)
 class Explained:
+    """A frame explained, and all that the next one begins with.
+
+    Attributes
+    ----------
+    fit : Fit
+        In units of the noise of a pixel.
+    stays : bool array
+        Which of the fit's particles are believed.
+    places : float64 array (P, 4 + K)
+        Of those, and of others that may be there: y, x (px), slice, amplitude, coefficients of the modes.
+    velocity : float64 array (P, 3)
+        Of y, x and slice, per frame.
+    population : Population
+    surface : int
+        Which of the backgrounds in `KNOTS` suits the frame.
+    variance : Variance
+    pixels : Pixels
+    gain, excess : float64 arrays
+        Log-likelihood that each particle of the fit adds; its chi-square over that of noise and patterns' errors.
+    """
+
     fit: Fit
     stays: NDArray[np.bool_]
     places: NDArray[np.float64]
     velocity: NDArray[np.float64]
     population: Population
+    surface: int
     variance: Variance
     pixels: Pixels
     gain: NDArray[np.float64]
+    excess: NDArray[np.float64]
 
 
 class Joint:
+    """Plan for frames of one shape, in one thread at a time.
+
+    Parameters
+    ----------
+    model : PatternModel
+    shape : (rows, columns)
+    threads : int
+        Threads within a frame; the result does not depend on them.
+    """
+
     def __init__(self, model: PatternModel, shape: tuple[int, int], threads: int = 1) -> None:
-        self.model, self.shape, self.threads = model, shape, threads
+        self.model, self.shape = model, shape
         self._peak = np.float32(model.peak.max())
+        fine, scale = model.nodes_per_px, 2
+        self._scale, self._small_shape = scale, tuple(-(-n // scale) for n in shape)
         patterns, error = model.patterns / self._peak, model.pattern_error / self._peak
         modes = None if model.modes is None else model.modes / self._peak
-        fine = model.nodes_per_px
-        self._error = error
-        self._renderer = Renderer(
-            patterns, fine, noise=1.0, surface=model.surface, modes=modes, error=error, threads=threads
-        )
-        self._surface = Background(shape, 2 * model.size)
-        scale = self._scale = 2
-        small = tuple(-(-n // scale) for n in shape)
-        reduced = _reduced(patterns, fine) if scale == 2 else patterns
-        blur = self._blur = model.size / 20 / scale
-        sharp = _high_passed(reduced, blur * fine)
-        trim = error.shape[-1] // 2 % 2
-        small_error = np.ascontiguousarray(error[:, trim : error.shape[1] - trim, trim : error.shape[2] - trim][:, ::scale, ::scale]) / scale
-        self._small_error = small_error
-        self._sharp = Renderer(sharp, fine, noise=1 / scale, surface=model.surface, error=small_error, threads=threads)
-        self._small = Renderer(reduced, fine, noise=1 / scale, surface=model.surface, error=small_error, threads=threads)
-        self._filter = MatchedFilter(np.ascontiguousarray(reduced[0][:, ::fine, ::fine]), small)
-        self._small_surface = Background(small, 2 * model.size / scale)
-        self._small_shape = small
+        self._full = self._level(patterns, error, 1, threads, modes)
+        half = reduced(patterns, fine)
+        error = np.ascontiguousarray(error[:, _even(error) :, _even(error) :][:, ::2, ::2][:, : half.shape[-1], : half.shape[-1]]) / 2
+        self._small = self._level(half, error, scale, threads)
+        self._blur = BLUR * model.size / scale
+        self._sharp = self._level(high_passed(half, self._blur * fine), error, scale, threads)
+        self._backgrounds = [Background(shape, model.size * k) for k in KNOTS]
+        self._small_backgrounds = [Background(self._small_shape, model.size * k / scale) for k in KNOTS]
+        self._filter = MatchedFilter(np.ascontiguousarray(half[0][:, ::fine, ::fine]), self._small_shape)
 
-    def first(self, frame):
+    def _level(
+        self, patterns: NDArray, error: NDArray, scale: int, threads: int, modes: NDArray | None = None
+    ) -> Level:
+        model = self.model
+        renderer = Renderer(
+            patterns, model.nodes_per_px, noise=1 / scale, surface=model.surface, modes=modes, error=error,
+            threads=threads,
+        )  # fmt: skip
+        return Level(renderer, error, model.nodes_per_px, model.size / scale, None)
+
+    def first(self, frame: NDArray[np.float32]) -> Explained:
+        """Explain a frame (rows, columns) of which nothing is known."""
         pixels = usable_pixels(frame)
-        frame = (pixels.filled - np.median(pixels.filled[::4, ::4])) / np.float32(pixels.noise)
-        places, population, variance, background = np.zeros((0, 4)), None, Variance(), None
-        weight = variance.weight(frame, pixels.valid)
-        for cycle in range(CYCLES):
-            places, population = self._search(frame, pixels, places, population)
-            fit = self._fitted(frame, places, weight, population, background, STEPS)
-            keep, _ = self._stays(self._renderer, fit, weight, self._error)
-            if MOVE[1]:
-                places, moved = self._moved(self._renderer, fit, keep, variance, pixels.valid)
-            else:
-                places = fit.places[keep]
-            background = fit.background
-            population = _population(fit, keep, population)
-            variance = learned_variance(fit.image, fit.residual, 1.0)
+        frame = self._normalised(pixels)
+        places, population, surface = self._search(frame, pixels)
+        variance, background = Variance(), None
+        weight = variance.weight(np.zeros_like(frame), pixels.valid)
+        for again in (True, True, False):
+            fit = self._fitted(frame, places, weight, population, surface, background, STEPS)
+            stays, population, new = self._reviewed(fit, weight, population, again)
+            variance, background = learned_variance(fit.image, fit.residual, 1.0), fit.background
+            places = self._likelier(fit, variance, pixels)[stays]
             weight = variance.weight(fit.image, pixels.valid)
-            odd = (fit.chi2 > 1.5)[keep]
-            self._report(f"full {cycle} odd {odd.sum()}", places, [])
-            if cycle == CYCLES - 1 or not odd.any():
+            self._report("full", places, new)
+            if not len(new):
                 break
-            places = places[~odd]
-        fit = self._fitted(frame, places, weight, population, background, 3)
+            places = np.concatenate([places, new])
+        fit = self._fitted(frame, places, weight, population, surface, background, 3)
         while True:
-            keep, gain = self._stays(self._renderer, fit, weight, self._error)
-            if keep.all():
+            total = self._full.error_variance(fit.places, self.shape)
+            gain = self._full.gain(fit, weight, total)
+            stays = self._full.staying(gain, fit.places, LEAST_GAIN)
+            if stays.all():
                 break
-            fit = self._fitted(frame, fit.places[keep], weight, population, fit.background, 2)
-        self._report("end", fit.places[keep], [])
-        return Explained(fit, keep, fit.places[keep], np.zeros((keep.sum(), 3)), population, variance, pixels, gain)
+            fit = self._fitted(frame, fit.places[stays], weight, population, surface, fit.background, 2)
+        self._report("end", fit.places, [])
+        excess = self._full.excess(fit, weight, total)
+        velocity = np.zeros((len(fit.places), 3))
+        return Explained(fit, stays, fit.places, velocity, population, surface, variance, pixels, gain, excess)
+
+    def following(self, frame: NDArray[np.float32], before: Explained) -> Explained:
+        """Explain the frame after one that is explained. A particle that appears in it is in the table of the next."""
+        pixels = usable_pixels(frame, before.pixels.noise)
+        frame = self._normalised(pixels)
+        places = before.places.copy()
+        places[:, :3] += before.velocity
+        weight = before.variance.weight(before.fit.image, pixels.valid)
+        fit = self._fitted(frame, places, weight, before.population, before.surface, before.fit.background, 2, near=True)
+        total = self._full.error_variance(fit.places, self.shape)
+        gain = self._full.gain(fit, weight, total)
+        stays = self._full.staying(gain, fit.places, LEAST_GAIN)
+        gone = before.stays.sum() - stays.sum()
+        if gone > max(LOST * before.stays.sum(), 2) or not stays.any():
+            return self.first(pixels.filled)
+        moved = (before.velocity + fit.places[:, :3] - before.places[:, :3])[stays] / 2
+        population = learned_population(fit, stays, before.population)
+        new = self._unexplained(fit, weight, total, population)
+        return Explained(
+            fit,
+            stays,
+            np.concatenate([fit.places[stays], new]),
+            np.concatenate([moved, np.zeros((len(new), 3))]),
+            population,
+            before.surface,
+            learned_variance(fit.image, fit.residual, 1.0),
+            pixels,
+            gain,
+            self._full.excess(fit, weight, total),
+        )
+
+    @property
+    def _open(self) -> bool:
+        """Whether the joint fit leaves a question open: how particles differ, or on which side of focus they are."""
+        return self.model.modes_count > 0 or bool(np.isfinite(self.model.twin).any())
+
+    def _alone(self, fit: Fit, variance: Variance, pixels: Pixels) -> tuple[Trials, Trials]:
+        """Each particle of a fit alone, its modes free: from where it is, and on the other side of focus."""
+        alone = Alone(self._full.renderer, fit, variance, pixels.valid)
+        own = alone.climbed(fit.places, np.arange(len(fit.places)))
+        height = field_terms(fit.places[:, 1], fit.places[:, 0], self.shape) @ self.model.surface
+        twin = np.interp(fit.places[:, 2] - height, np.arange(self.model.count), self.model.twin) + height
+        return own, alone.best(np.clip(twin[:, None] + ASTRAY, 0, self.model.count - 1))
+
+    def _likelier(self, fit: Fit, variance: Variance, pixels: Pixels) -> NDArray[np.float64]:
+        """Places of a fit's particles, with their modes, on the side of focus that is likelier."""
+        if not self._open or not len(fit.places):
+            return fit.places
+        own, other = self._alone(fit, variance, pixels)
+        return np.where((other.gain > own.gain)[:, None], other.places, own.places)
+
+    def _normalised(self, pixels: Pixels) -> NDArray[np.float32]:
+        """The frame in units of its noise, about its median."""
+        return (pixels.filled - np.median(pixels.filled[::4, ::4])) / np.float32(pixels.noise)
 
     def _report(self, name, places, new):
         if DEBUG is not None:
             DEBUG(self, name, places, new)
 
-    def _fitted(self, frame, places, weight, population, background, steps, near=False):
-        return fitted(self._renderer, frame, places, weight, population, steps=steps, surface=self._surface,
-                      background=background, near=near)
+    def _fitted(
+        self,
+        frame: NDArray[np.float32],
+        places: NDArray[np.float64],
+        weight: NDArray[np.float32],
+        population: Population,
+        surface: int,
+        background: NDArray[np.float32] | None,
+        steps: int,
+        near: bool = False,
+    ) -> Fit:
+        """All particles and the background at full resolution."""
+        return fitted(
+            self._full.renderer, frame, places, weight, population, steps=steps, surface=self._backgrounds[surface],
+            background=background, near=near,
+        )  # fmt: skip
 
-    def _errors(self, renderer, places, error, shape):
-        slices = places[:, 2] - field_terms(places[:, 1], places[:, 0], shape) @ renderer.surface
-        boxes = renderer.boxes(places, slices, shape)
-        return draw_error(error, self.model.nodes_per_px, places, boxes, slices, shape)
+    def _reviewed(
+        self, fit: Fit, weight: NDArray[np.float32], population: Population, search: bool
+    ) -> tuple[NDArray[np.bool_], Population, NDArray[np.float64]]:
+        """Which particles of a fit stay, their population, and further ones, if they are to be sought."""
+        total = self._full.error_variance(fit.places, self.shape)
+        stays = self._full.staying(self._full.gain(fit, weight, total), fit.places, LEAST_GAIN)
+        population = learned_population(fit, stays, population)
+        new = self._unexplained(fit, weight, total, population) if search else fit.places[:0]
+        return stays, population, new
 
-    def _stays(self, renderer, fit, weight, error):
-        places, shape = fit.places[fit.order], fit.frame.shape
-        if not len(places):
-            return np.zeros(0, bool), np.zeros(0)
-        slices = places[:, 2] - field_terms(places[:, 1], places[:, 0], shape) @ renderer.surface
-        total = draw_error(error, self.model.nodes_per_px, places, fit.columns.boxes, slices, shape)
-        sure = energy_beside_errors(fit.columns, error, self.model.nodes_per_px, places, slices, weight, total)
-        ratio = np.empty(len(places))
-        ratio[fit.order] = sure / np.maximum(fit.energy[fit.order], 1e-12)
-        gain = fit.gain * np.minimum(ratio, 1) - fit.population.penalty(fit.places[:, 3])
-        bad = gain < (SHARP_GAIN if renderer is self._sharp else LEAST_GAIN)
-        # Of two that explain the same, each explains nothing beside the other: the worse one goes first.
-        drop = np.zeros(len(bad), bool)
-        for i in np.argsort(gain)[: bad.sum()]:
-            near = np.hypot(*(fit.places[i, :2] - fit.places[drop, :2]).T) < self.model.size / 6 / (1 if shape == self.shape else self._scale)
-            drop[i] = not near.any()
-        return ~drop, gain
+    def _unexplained(
+        self, fit: Fit, weight: NDArray[np.float32], total: NDArray[np.float32], population: Population
+    ) -> NDArray[np.float64]:
+        """Places of further particles, at full resolution; some may lie outside the frame."""
+        left = cv2.pyrDown(fit.residual * np.sqrt(weight / (1 + weight * total)))
+        return self._new(left, population, fit.places.shape[1], whiten=False, outside_px=self.model.size / 4)
 
-    def _moved(self, renderer, fit, keep, variance, valid):
-        """Places of the particles that stay, the odd ones at another depth where that is likelier."""
-        chi2 = fit.chi2
-        odd = np.flatnonzero(keep & (chi2 > ODD * max(np.median(chi2[keep]), 1e-9 if renderer is self._sharp else 1)))
-        places = fit.places.copy()
-        moved = 0
-        if len(odd):
-            alone = Alone(renderer, fit, variance, valid)
-            own, other = alone.climbed(places[odd], odd, 2), alone.best_elsewhere(odd, APART)
-            better = other.gain > own.gain + 10
-            places[odd[better]] = other.places[better]
-            moved = better.sum()
-        return places[keep], moved
-
-    def _unexplained(self, fit, pixels, population, weight):
-        total = self._errors(self._renderer, fit.places, self._error, self.shape)
-        left = fit.residual * np.sqrt(weight / (1 + weight * total))
-        small = cv2.pyrDown(left)
-        new = self._new(small, population, whiten=WH[1], outside_px=self.model.size / 4)
-        return new * (self._scale, self._scale, 1, 1)
-
-    def _new(self, left, population, *, whiten, outside_px=0.0):
-        narrow = population is not None and population.sigma < 0.5
-        kwargs = dict(brightness=population.centre, spread=max(population.sigma, 0.05) * population.centre) if narrow else {}
-        new, gain = self._filter(left, 1 / self._scale, whiten=whiten, least=LEAST_GAIN, share=0.1 if narrow else 0,
-                                 apart_px=self.model.size / 6 / self._scale, outside_px=outside_px / self._scale, **kwargs)
-        if narrow:
-            new[:, 3] = np.clip(new[:, 3], population.centre * np.exp(-2*population.sigma), population.centre*np.exp(2*population.sigma))
-        order = np.argsort(-gain, kind="stable")
-        new, gain = new[order], gain[order]
-        keep = np.ones(len(new), bool)
-        if not narrow:
-            radius = self.model.size / 2 / self._scale
-            for i in range(len(new)):
-                near = np.hypot(*(new[i, :2] - new[:i, :2][keep[:i]]).T) < radius
-                keep[i] = not (near & (gain[:i][keep[:i]] > 3 * gain[i])).any()
-        return new[keep]
-
-    def _search(self, frame, pixels, places, population):
+    def _new(
+        self,
+        left: NDArray[np.float32],
+        population: Population | None,
+        width: int = 4,
+        *,
+        whiten: bool,
+        outside_px: float = 0,
+    ) -> NDArray[np.float64]:
+        """Places (P, width), at full resolution, of further particles in what others leave at the search's."""
         scale = self._scale
-        small = cv2.pyrDown(frame)
-        valid = cv2.pyrDown(pixels.valid.astype(np.float32)) > 0.9
-        weight = valid * np.float32(scale**2)
-        sharp = _high_passed(small[None], self._blur)[0]
-        places, background = places / (scale, scale, 1, 1), np.float32(0)
-        image = self._small.image(places, small.shape)
-        for stage, rounds in (("sharp", 5), ("plain", 3)):
-            renderer = self._sharp if stage == "sharp" else self._small
-            for r in range(rounds):
-                if stage == "plain":
-                    background = self._small_surface.fit(small - image, weight)
-                total = self._errors(self._small, places, self._small_error, small.shape)
-                left = (small - image - background) / np.sqrt(1 + scale**2 * total)
-                new = self._new(left, population, whiten=stage == "sharp" or WH[0])
-                self._report(f"{stage}{r}", places * (scale, scale, 1, 1), new * (scale, scale, 1, 1))
-                if not len(new):
-                    break
-                if population is None:
-                    population = Population(float(np.median(new[:, 3])), 2.0)
-                fit = fitted(renderer, sharp if stage == "sharp" else small - background, np.concatenate([places, new]),
-                             weight, population, steps=STEPS)
-                keep, _ = self._stays(renderer, fit, weight, self._small_error)
-                places = self._moved(renderer, fit, keep, Variance(1 / scale**2), valid)[0] if MOVE[0] else fit.places[keep]
-                population = _population(fit, keep, population)
-                image = self._small.image(places, small.shape)
-                if len(new) < 0.05 * len(places):
-                    break
-        places = places * (scale, scale, 1, 1)
-        return places, population or Population(1.0, 2.0)
+        new = self._filter(
+            left, 1 / scale, population, whiten=whiten, size=self.model.size / scale, outside_px=outside_px / scale
+        )
+        return np.pad(new * (scale, scale, 1, 1), ((0, 0), (0, width - 4)))
 
-    def table(self, e: Explained) -> pd.DataFrame:
-        fit, model = e.fit, self.model
-        y, x, step, amplitude = fit.places[:, :4].T
-        z_um, steps = model.z_um, np.arange(model.count)
-        y_std, x_std, step_std = fit.std.T
-        misfit = np.sqrt(1 + 5.0 * np.maximum(fit.chi2 - 1, 0))
-        own = [np.interp(step, steps, o) for o in model.own_error.T]
-        table = pd.DataFrame({
-            "x_px": x, "y_px": y,
-            "z_um": np.interp(step, steps, np.clip(z_um - model.own_bias_um, z_um[0], z_um[-1])),
-            "cm": fit.cm, "at_end": (step <= 0) | (step >= model.count - 1),
-            "x_std_px": misfit * np.hypot(x_std, own[0]), "y_std_px": misfit * np.hypot(y_std, own[1]),
-            "z_std_um": misfit * np.hypot(step_std * np.interp(step, steps, np.gradient(z_um)), own[2]),
-            "amplitude": amplitude * e.pixels.noise / self._peak, "chi2": fit.chi2, "gain": e.gain, "gain_fraction": fit.gain/np.maximum(fit.energy*amplitude**2/2,1e-9),
-        })
+    def _search(self, frame: NDArray[np.float32], pixels: Pixels) -> tuple[NDArray[np.float64], Population, int]:
+        """Places of particles, to a fraction of a pixel, their population, and which background suits."""
+        search = _Search(self, frame, pixels)
+        for cycle in range(CYCLES):
+            search.find(self._sharp, ROUNDS)
+            search.find(self._small, ROUNDS)
+            odd = search.odd()
+            self._report(f"odd {odd.sum()}", search.places * (2, 2, 1, 1), search.places[odd] * (2, 2, 1, 1))
+            if cycle == CYCLES - 1 or not odd.any():
+                break
+            search.take_out(odd)
+        places = search.places * (self._scale, self._scale, 1, 1)
+        return np.pad(places, ((0, 0), (0, self.model.modes_count))), search.population or UNKNOWN, search.surface or 0
+
+    def table(self, explained: Explained) -> pd.DataFrame:
+        """What is in a frame.
+
+        Returns
+        -------
+        DataFrame
+            A row for each particle in the frame, highest `cm` first. `x_px`, `y_px`, `z_um`; `cm`, the correlation
+            of its image with what the others leave of the frame; `at_end`, whether z may lie beyond the stack;
+            `x_std_px`, `y_std_px`, `z_std_um`, standard deviations (noise of the frame, neighbours, errors of the
+            patterns, misfit); `amplitude`, 1 for the calibration's particle; `chi2`, the mean square of the residual
+            around it, over the variance; `chi2_without`, the same were the particle removed; `z_other_um`, the best
+            depth on the other side of focus, NaN where there is none; `log_ratio`, the logarithm of the likelihood of
+            the first depth over that of the second; `ambiguous`, whether that is below `AMBIGUOUS`. `attrs` counts
+            the pixels left out: `saturated_px` and `defective_px`.
+        """
+        fit, model = explained.fit, self.model
+        y, x, slices, amplitude = fit.places[:, :4].T
+        at = np.arange(model.count)
+        variance, z_other, log_ratio = fit.std**2, np.full(len(y), np.nan), np.full(len(y), np.inf)
+        if self._open and len(y):
+            own, other = self._alone(fit, explained.variance, explained.pixels)
+            log_ratio = own.gain - other.gain
+            z_other = np.where(np.isfinite(other.gain), np.interp(other.places[:, 2], at, model.z_um), np.nan)
+            variance = variance + own.variance_of_modes()
+        unusual = np.log(amplitude / explained.population.centre) / explained.population.sigma
+        misfit = np.sqrt(1 + CORRELATED * np.maximum(explained.excess - 1, 0) + (unusual / UNUSUAL) ** 2)
+        own_error = np.stack([np.interp(slices, at, error) for error in model.own_error.T])
+        y_std, x_std, slice_std = np.sqrt(variance).T
+        frame_std = x_std, y_std, slice_std * np.interp(slices, at, np.gradient(model.z_um))
+        x_std, y_std, z_std = misfit * np.hypot(frame_std, own_error)
+        z_um = np.clip(model.z_um - model.own_bias_um, model.z_um[0], model.z_um[-1])
+        table = pd.DataFrame(
+            {
+                "x_px": x,
+                "y_px": y,
+                "z_um": np.interp(slices, at, z_um),
+                "cm": fit.cm,
+                "at_end": (slices <= 0) | (slices >= model.count - 1),
+                "x_std_px": x_std,
+                "y_std_px": y_std,
+                "z_std_um": z_std,
+                "amplitude": amplitude * explained.pixels.noise / self._peak,
+                "chi2": fit.chi2,
+                "chi2_without": fit.chi2 + 2 * explained.gain / fit.area,
+                "z_other_um": z_other,
+                "log_ratio": log_ratio,
+                "ambiguous": log_ratio < AMBIGUOUS,
+            }
+        )
         rows, columns = self.shape
-        inside = e.stays & (y >= -0.5) & (y < rows - 0.5) & (x >= -0.5) & (x < columns - 0.5)
-        return table[inside].sort_values("cm", ascending=False, ignore_index=True)
+        inside = explained.stays & (y >= -0.5) & (y < rows - 0.5) & (x >= -0.5) & (x < columns - 0.5)
+        if EXTRA: table = table.assign(gain=explained.gain, excess=explained.excess, gain_fraction=fit.gain / np.maximum(fit.energy * amplitude**2 / 2, 1e-9))
+        table = table[inside].sort_values("cm", ascending=False, ignore_index=True)
+        table.attrs |= {"saturated_px": explained.pixels.saturated, "defective_px": explained.pixels.defective}
+        return table
 
 
-def _reduced(patterns: NDArray, fine: int) -> NDArray[np.float32]:
-    """Patterns (M, N, m, m) at half the resolution, as `cv2.pyrDown` makes of frames, with as many nodes per pixel."""
-    kernel = np.zeros(4 * fine + 1, np.float32)
-    kernel[::fine] = np.array([1, 4, 6, 4, 1]) / 16
-    half = patterns.shape[-1] // 2
-    trim = half % 2
+class _Search:
+    """A frame at the resolution of the search, and the particles found so far."""
+
+    def __init__(self, joint: Joint, frame: NDArray[np.float32], pixels: Pixels) -> None:
+        self._joint, scale = joint, joint._scale
+        self._frame = cv2.pyrDown(frame)
+        self._sharp_frame = high_passed(self._frame[None], joint._blur)[0]
+        valid = True if pixels.valid.all() else cv2.pyrDown(pixels.valid.astype(np.float32)) > 0.9
+        self._weight = np.full(self._frame.shape, scale**2, np.float32) * valid
+        self._scale = scale
+        self.places, self.population = np.zeros((0, 4)), None
+        self._fit, self.surface = None, None
+        self._image, self._background = np.zeros_like(self._frame), np.float32(0)
+
+    def find(self, level: Level, rounds: int) -> None:
+        """Find further particles until there are no more."""
+        joint = self._joint
+        plain = level is joint._small
+        least = LEAST_GAIN if plain else SHARP_GAIN
+        for _ in range(rounds):
+            if plain:
+                unexplained = self._frame - self._image
+                if self.surface is None:
+                    self.surface = suitable(joint._small_backgrounds, unexplained, self._weight, joint.model.size / 16)
+                self._background = joint._small_backgrounds[self.surface].fit(unexplained, self._weight)
+            total = joint._small.error_variance(self.places, self._frame.shape)
+            left = (self._frame - self._image - self._background) / np.sqrt(1 + self._scale**2 * total)
+            new = joint._new(left, self.population, whiten=True) / (self._scale, self._scale, 1, 1)
+            joint._report("plain" if plain else "sharp", self.places * (2, 2, 1, 1), new * (2, 2, 1, 1))
+            if not len(new):
+                break
+            self._add(level, new, least, self._frame - self._background if plain else self._sharp_frame)
+            if len(new) < 0.05 * len(self.places):
+                break
+
+    def _add(self, level: Level, new: NDArray[np.float64], least: float, frame: NDArray[np.float32]) -> None:
+        """Fit further particles with the others, and drop those that add too little."""
+        population = self.population or Population(float(np.median(new[:, 3])), UNKNOWN.sigma)
+        places = np.concatenate([self.places, new])
+        fit = fitted(level.renderer, frame, places, self._weight, population, steps=STEPS)
+        total = level.error_variance(fit.places, frame.shape)
+        stays = level.staying(level.gain(fit, self._weight, total), fit.places, least)
+        self._fit, self._stays, self._total = fit, stays, total
+        self.places = fit.places[stays]
+        self.population = learned_population(fit, stays, population)
+        self._image = self._joint._small.renderer.image(self.places, frame.shape)
+
+    def odd(self) -> NDArray[np.bool_]:
+        """Which particles have a residual that is more than noise."""
+        if not len(self.places):
+            return np.zeros(0, bool)
+        excess = self._joint._small.excess(self._fit, self._weight, self._total)
+        return self._joint._small.odd(self.places, excess[self._stays])
+
+    def take_out(self, which: NDArray[np.bool_]) -> None:
+        """Go on without those."""
+        self.places = self.places[~which]
+        self._image = self._joint._small.renderer.image(self.places, self._frame.shape)
+
+
+def _even(patterns: NDArray) -> int:
+    """Nodes to leave out at the border, so that the middle one has an even index."""
+    return patterns.shape[-1] // 2 % 2
+
+
+def reduced(patterns: NDArray[np.float32], nodes_per_px: int) -> NDArray[np.float32]:
+    """Patterns (M, N, m, m) at half the resolution, as `cv2.pyrDown` makes it of frames, with as many nodes per pixel."""
+    kernel, trim = np.zeros(4 * nodes_per_px + 1, np.float32), _even(patterns)
+    kernel[::nodes_per_px] = np.array([1, 4, 6, 4, 1]) / 16
     flat = patterns.reshape(-1, *patterns.shape[-2:])
-    out = [cv2.sepFilter2D(np.ascontiguousarray(p), -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)[trim : 2 * half + 1 - trim, trim : 2 * half + 1 - trim][::2, ::2] for p in flat.astype(np.float32)]
-    out = np.stack(out)
-    return out.reshape(*patterns.shape[:2], *out.shape[-2:])
+    out = np.stack([cv2.sepFilter2D(p, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101) for p in flat])
+    end = patterns.shape[-1] - trim
+    out = out[:, trim:end:2, trim:end:2]
+    return np.ascontiguousarray(out.reshape(*patterns.shape[:2], *out.shape[-2:]))
 
 
-def _high_passed(images: NDArray, blur: float) -> NDArray[np.float32]:
+def high_passed(images: NDArray[np.float32], blur: float) -> NDArray[np.float32]:
     """Images (..., rows, columns) less what remains of them when blurred."""
-    flat = images.reshape(-1, *images.shape[-2:]).astype(np.float32)
-    return np.stack([i - cv2.GaussianBlur(i, (0, 0), blur, borderType=cv2.BORDER_REFLECT) for i in flat]).reshape(images.shape)
-
-
-def _population(fit: Fit, keep: NDArray, before: Population) -> Population:
-    if not keep.any():
-        return before
-    a = fit.places[keep, 3]
-    log = np.log(a)
-    centre = float(np.median(log))
-    mad = np.median(np.abs(log - centre)) * 1.4826
-    known = np.median((fit.amplitude_std[keep] / a) ** 2)
-    scatter = np.sqrt(max(mad**2 - known, 0))
-    return Population(float(np.exp(centre)), float(np.hypot(max(scatter, 0.02), 0.1 / np.sqrt(len(a)))))
+    flat = images.reshape(-1, *images.shape[-2:])
+    out = [image - cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REFLECT) for image in flat]
+    return np.stack(out).reshape(images.shape)

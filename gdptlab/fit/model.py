@@ -21,6 +21,9 @@ from gdptlab.denoising import noise_level
 from gdptlab.fit.bounds import own_bias_um, own_error, recalibration_errors
 from gdptlab.fit.pattern import continued, particle_light
 
+ALIKE = 0.85
+"""Correlation of the patterns at two depths from which on the one may be taken for the other."""
+
 ERROR_SCALE_PX = 2.0
 """Scale, in px, on which the error of the patterns is compared with white noise; about the width of their finest
 details, and on this scale a matched filter sums pixels."""
@@ -115,6 +118,22 @@ class PatternModel:
     def peak(self) -> NDArray[np.float64]:
         """Largest deviation of the mean pattern from the background at each slice, counts at amplitude 1, (N,)."""
         return np.abs(gaussian_filter(self.images, (0, 1, 1))).max(axis=(1, 2)).astype(float)
+
+    @cached_property
+    def twin(self) -> NDArray[np.float64]:
+        """Slice (N,) on the other side of focus that looks most like each slice; NaN where none looks alike.
+
+        The other side begins where the correlation, going away from a slice, rises again.
+        """
+        flat = self.images.reshape(self.count, -1)
+        flat = flat / np.linalg.norm(flat, axis=1, keepdims=True)
+        twin, slices = np.full(self.count, np.nan), np.arange(self.count)
+        for k, row in enumerate(flat @ flat.T):
+            falling = np.concatenate([np.minimum.accumulate(row[k::-1])[:0:-1], np.minimum.accumulate(row[k:])])
+            other = np.where(row > falling + 0.02, row, 0)
+            if other.max() > ALIKE:
+                twin[k] = slices[other.argmax()]
+        return twin
 
 
 def error_density(errors: NDArray, nodes_per_px: int) -> NDArray[np.float32]:

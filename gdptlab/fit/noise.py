@@ -26,6 +26,9 @@ HOT = 8.0
 PLATEAU = 4
 """Fewest pixels at the highest value for it to be the top of the camera's range."""
 
+LEAST_NOISE = 1e-5
+"""Least noise, as a fraction of the range of a frame's values, of frames that were computed without."""
+
 BINS = 12
 """Bins of the model image in which the variance of the residual is estimated."""
 
@@ -52,48 +55,53 @@ class Pixels:
     filled: NDArray[np.float32]
 
 
-def usable_pixels(frame: NDArray[np.float32]) -> Pixels:
-    """Find the pixels of a frame (rows, columns) that tell something."""
-    noise = max(noise_level(frame), 1e-5 * float(np.ptp(np.percentile(frame[::4, ::4], (1, 99)))))
-    if not noise > 1e-15:  # a blank frame has none, or one whose square is lost in float32
-        noise = 1.0
-    defective = np.zeros(frame.shape, np.uint8)
-    around = cv2.medianBlur(frame, 5)
-    _defective(frame, around, np.float32(HOT * noise), np.float32(ALONE), defective)
-    usual = frame[defective == 0]
-    top = usual.max(initial=-np.inf)
-    at_top, near_top = np.count_nonzero(usual == top), np.count_nonzero((usual > top - 2 * noise) & (usual < top))
-    saturated = np.zeros(frame.shape, np.uint8)
-    if at_top >= PLATEAU and at_top > near_top and usual.min(initial=top) < top:
-        saturated = cv2.dilate((frame >= top).astype(np.uint8) & ~defective, np.ones((3, 3), np.uint8))
-    valid = (defective | saturated) == 0
-    filled = frame if valid.all() else np.where(defective, around, frame)
-    return Pixels(valid, int(saturated.sum()), int(defective.sum()), noise, filled)
+def usable_pixels(frame: NDArray[np.float32], noise: float | None = None) -> Pixels:
+    """Find the pixels of a frame (rows, columns) that tell something; the `noise` of a pixel if it is known."""
+    if noise is None:
+        inner = np.percentile(frame[::4, ::4], (1, 99))
+        noise = max(noise_level(frame), LEAST_NOISE * float(np.ptp(inner)))
+        noise = noise if noise > 1e-15 else 1.0  # a blank frame has none, or one whose square is lost in float32
+    filled, defective = frame.copy(), np.zeros(frame.shape, np.bool_)
+    _mend(frame, np.float32(HOT * noise), np.float32(ALONE), filled, defective)
+    top = filled.max()
+    near_top = np.count_nonzero(filled > top - 2 * noise)
+    at_top = np.count_nonzero(filled == top)
+    saturated = np.zeros(frame.shape, np.bool_)
+    if at_top >= PLATEAU and 2 * at_top > near_top and filled.min() < top:
+        saturated = cv2.dilate((filled == top).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return Pixels(~(defective | saturated), int(saturated.sum()), int(defective.sum()), noise, filled)
 
 
 @compiled
-def _defective(frame, around, least, alone, out):  # pragma: no cover
-    """Mark pixels that stand alone: all but one of their eight neighbours are far less away from the median."""
+def _mend(frame, least, alone, filled, defective):  # pragma: no cover
+    """Mark pixels that stand alone, and give them the median of their neighbours.
+
+    A pixel stands alone if all but one of its neighbours are far less away from their median.
+    """
     rows, columns = frame.shape
+    around = np.empty(8, np.float32)
     for r in range(rows):
+        up, down = max(r - 1, 0), min(r + 1, rows - 1)
         for c in range(columns):
-            middle = around[r, c]
-            away = abs(frame[r, c] - middle)
-            if away <= least:
+            left, right = max(c - 1, 0), min(c + 1, columns - 1)
+            value = frame[r, c]
+            # Nearly all pixels are done with here.
+            if abs(2 * value - frame[r, left] - frame[r, right]) < least:
                 continue
-            sign = np.float32(1) if frame[r, c] > middle else np.float32(-1)
-            first = second = np.float32(0)
-            for i in range(max(r - 1, 0), min(r + 2, rows)):
-                for j in range(max(c - 1, 0), min(c + 2, columns)):
-                    if i == r and j == c:
-                        continue
-                    other = sign * (frame[i, j] - middle)
-                    if other > first:
-                        first, second = other, first
-                    elif other > second:
-                        second = other
-            if away > least + alone * second:
-                out[r, c] = 1
+            if abs(2 * value - frame[up, c] - frame[down, c]) < least:
+                continue
+            count = 0
+            for i in range(up, down + 1):
+                for j in range(left, right + 1):
+                    if i != r or j != c:
+                        around[count] = frame[i, j]
+                        count += 1
+            ordered = np.sort(around[:count])
+            middle = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
+            away = value - middle
+            second = ordered[count - 2] - middle if away > 0 else middle - ordered[1]
+            if abs(away) > least + alone * second:
+                filled[r, c], defective[r, c] = middle, True
 
 
 @dataclass(frozen=True)

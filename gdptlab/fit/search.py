@@ -1,4 +1,4 @@
-"""Where a particle would explain most of a residual: a matched filter for all depths at once.
+"""The search: where a further particle would explain most of a residual, by a matched filter for all depths at once.
 
 What hides a particle in a crowd is not the camera's noise but the light of its neighbours, which is strong and
 smooth. The filter therefore takes all that is left of the frame for noise with the spectrum that it has
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gdptlab.cores import compiled
+from gdptlab.fit.solver import Population
 from gdptlab.spectra import good_shape, packed, smooth_power, times_conjugate
 
 DEPTHS = 13
@@ -20,7 +21,23 @@ RANK = 10
 """Singular images that stand for all depths."""
 
 SMOOTHING = 4.0
-"""Of the spectrum, in frequency steps."""
+"""Standard deviation, in frequency steps, over which the power of the residual's spectrum is smoothed."""
+
+LEAST_GAIN = 20.0
+"""Log-likelihood that a particle must add: chi-square of 40 with 4 degrees of freedom, which noise reaches at one place
+in ten million, and a frame has some ten thousand places to be at."""
+
+WIDE = 0.5
+"""Standard deviation of the logarithm of amplitudes from which on the search takes them for free."""
+
+LEAST_SPREAD = 0.05
+"""Least relative standard deviation of amplitudes in the search, which looks at whole pixels and few depths."""
+
+SHARE = 0.1
+"""Fraction of the gain of a lone particle that a further one must bring, where amplitudes are known."""
+
+SIDE_LOBE = 3.0
+"""A peak may be a side-lobe of one within half a template whose gain is so many times its own: it waits."""
 
 
 class MatchedFilter:
@@ -29,7 +46,7 @@ class MatchedFilter:
     Parameters
     ----------
     images : array (N, n, n)
-        A particle of brightness 1 at N depths, on no background; n is odd.
+        A particle of amplitude 1 at N depths, on no background; n is odd.
     shape : (rows, columns)
         Of the frames.
     """
@@ -58,16 +75,13 @@ class MatchedFilter:
         self,
         residual: NDArray[np.float32],
         noise: float,
+        population: Population | None,
         *,
-        brightness: float = 1.0,
-        spread: float = np.inf,
         whiten: bool,
-        least: float,
-        share: float,
-        apart_px: float,
+        size: float,
         outside_px: float = 0.0,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Find the best places for further particles.
+    ) -> NDArray[np.float64]:
+        """Find the best places for further particles, bright ones first.
 
         Parameters
         ----------
@@ -75,24 +89,43 @@ class MatchedFilter:
             The frame without background and without the particles found so far.
         noise : float
             Standard deviation of a pixel.
-        brightness, spread : float
-            What the particles' brightness is known to be; a spread of infinity: nothing.
+        population : Population, optional
+            What is known of the particles' amplitudes.
         whiten : bool
             Take all of the residual for noise, rather than the camera's alone.
-        least : float
-            Gain in log-likelihood below which there is no particle.
-        share : float
-            Of the gain that a lone particle would bring, below which there is none.
-        apart_px : float
-            Of places nearer than this only the best is given.
+        size : float
+            Rows and columns of a template, px. Of places nearer than a sixth of it only the best is given.
         outside_px : float
             How far beyond the frame's edge to look.
 
         Returns
         -------
-        places : float64 array (P, 4)
-            y, x (px), step along the stack, brightness.
-        gain : float64 array (P,)
+        float64 array (P, 4)
+            y, x (px), slice, amplitude.
+        """
+        if population is None or population.sigma > WIDE:
+            found, gain = self._peaks(residual, noise, 1.0, np.inf, 0.0, whiten, size / 6, outside_px)
+            return found[_in_the_open(found, gain, size / 2)]
+        centre, sigma = population.centre, population.sigma
+        spread = max(sigma, LEAST_SPREAD) * centre
+        found, _ = self._peaks(residual, noise, centre, spread, SHARE, whiten, size / 6, outside_px)
+        found[:, 3] = np.clip(found[:, 3], centre * np.exp(-2 * sigma), centre * np.exp(2 * sigma))
+        return found
+
+    def _peaks(
+        self,
+        residual: NDArray[np.float32],
+        noise: float,
+        centre: float,
+        spread: float,
+        fraction: float,
+        whiten: bool,
+        apart_px: float,
+        outside_px: float,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Peaks (P, 4) of the gain in log-likelihood, best first, and the gain (P,).
+
+        The prior of the amplitude is normal; a peak brings at least `fraction` of what a lone particle would.
         """
         (rows, columns), pad = self._shape, self._half
         canvas = np.zeros(self._padded, dtype=np.float32)
@@ -110,32 +143,43 @@ class MatchedFilter:
             times_conjugate(spectrum, image, self._product)
             cv2.idft(self._product, map_, flags=cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
         cut = self._energy * (energy / self._energy[:, -1, -1])[:, None, None]
-        known = 0.0 if np.isinf(spread) else spread**-2
+        known = spread**-2
         gain, bright = (np.zeros((rows + 2 * pad, columns + 2 * pad), np.float32) for _ in range(2))
         best = np.zeros(gain.shape, np.int32)
         margin = int(np.clip(round(pad - outside_px), 0, pad))
         cut = cut.astype(np.float32)
-        _gain(self._maps, self._mix, cut, rows, columns, margin, brightness, known, share, gain, best, bright)
+        _gain(self._maps, self._mix, cut, rows, columns, margin, centre, known, fraction, gain, best, bright)
 
         width = 2 * max(round(apart_px), 1) + 1
         near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
-        i, j = np.nonzero((gain > least) & (gain == cv2.dilate(gain, near)))
-        return np.stack([i - pad, j - pad, self._steps[best[i, j]], bright[i, j]], axis=1).astype(float), gain[i, j]
+        i, j = np.nonzero((gain > LEAST_GAIN) & (gain == cv2.dilate(gain, near)))
+        found = np.stack([i - pad, j - pad, self._steps[best[i, j]], bright[i, j]], axis=1).astype(float)
+        order = np.argsort(-gain[i, j], kind="stable")
+        return found[order], gain[i, j][order]
+
+
+def _in_the_open(found: NDArray[np.float64], gain: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
+    """Which of the peaks (P, 4), best first, are not beside a far better one, whose side-lobes they may be."""
+    keep = np.ones(len(found), bool)
+    for i in range(len(found)):
+        better = keep[:i] & (gain[:i] > SIDE_LOBE * gain[i])
+        keep[i] = not (np.hypot(*(found[:i, :2][better] - found[i, :2]).T) < distance).any()
+    return keep
 
 
 @compiled
-def _gain(maps, mix, cut, rows, columns, margin, brightness, known, share, gain, best, bright):  # pragma: no cover
-    """Highest gain over the depths at each place, with the brightness that brings it.
+def _gain(maps, mix, cut, rows, columns, margin, centre, known, fraction, gain, best, bright):  # pragma: no cover
+    """Highest gain over the depths at each place, with the amplitude that brings it.
 
-    A particle of brightness b changes minus the log-likelihood by b**2 e / 2 - b c + known (b - brightness)**2 / 2;
+    A particle of amplitude a changes minus the log-likelihood by a**2 e / 2 - a c + known (a - centre)**2 / 2;
     c is its product with the residual, mixed from those of the singular images, and e its energy, less where the
     frame's edge cuts it.
     """
     depths, (height, width) = len(mix), gain.shape
     n = cut.shape[1] - 1
     half = n // 2
-    aim, known = np.float32(brightness * known), np.float32(known)
-    base, least = np.float32(brightness**2) * known, np.float32(share * brightness**2)
+    aim, known = np.float32(centre * known), np.float32(known)
+    base, least = np.float32(centre**2) * known, np.float32(fraction * centre**2)
     zero, half_of = np.float32(0), np.float32(0.5)
     inverse = np.empty((depths, width), np.float32)
     between, product = np.empty(n + 1, np.float32), np.empty(width, np.float32)

@@ -82,7 +82,16 @@ class Fit:
     @property
     def chi2(self) -> NDArray[np.float64]:
         """Mean square of the residual on each particle's support, over its variance, (P,)."""
-        return self._in_order(self._chi2 / np.maximum(np.diff(self._columns.starts), 1))
+        return self._in_order(self._chi2) / self.area
+
+    @property
+    def area(self) -> NDArray[np.int64]:
+        """Pixels of each particle's support in the frame, 1 or more, (P,)."""
+        return self._in_order(np.maximum(np.diff(self._columns.starts), 1))
+
+    def chi2_of(self, residual: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
+        """The same as `chi2`, of another residual and weight."""
+        return self._in_order(self._columns.gradient(residual, weight)[1]) / self.area
 
     @property
     def std(self) -> NDArray[np.float64]:
@@ -103,7 +112,7 @@ class Fit:
         """
         amplitude = self.places[self._order, 3]
         precision = np.maximum(1 / self._variances[:, 3] - self.population.precision(amplitude), 1e-12)
-        best = amplitude + self._gradient[:, 3] / precision
+        best = amplitude - self.population.pull(amplitude) / precision  # where likelihood and prior balance
         return self._in_order(amplitude * (2 * best - amplitude) * precision / 2)
 
     @property
