@@ -30,12 +30,9 @@ from gdptlab import Calibration, datasets, match
 from gdptlab.autocalibrate import _size as scan_size
 from gdptlab.autocalibrate import find_beads
 from gdptlab.fit import Joint, PatternModel
-from gdptlab.fit.background import Background
 from gdptlab.fit.learning import learned
-from gdptlab.fit.model import field_terms
-from gdptlab.fit.noise import learned_variance
-from gdptlab.fit.renderer import Renderer
-from gdptlab.fit.solver import Population, fitted
+from gdptlab.fit.noise import Pixels
+from gdptlab.fit.solver import Population
 from gdptlab.imagetypes import Camera, as_image_type
 from gdptlab.optics import Microscope, _library
 
@@ -337,33 +334,24 @@ def joint(frame: NDArray, model: PatternModel, _: pd.DataFrame) -> pd.DataFrame:
     return plan.table(plan.first(frame.astype(np.float32)))
 
 
+class FromTruth(Joint):
+    """The joint fit that starts from the true particles instead of a search: what the images allow."""
+
+    truth: pd.DataFrame
+
+    def _search(self, frame: NDArray, pixels: Pixels) -> tuple[NDArray, Population, int]:
+        amplitude = self.truth["amplitude"] * float(self.model.peak.max()) / pixels.noise
+        step = np.interp(self.truth["z_um"], self.model.z_um, np.arange(self.model.count))
+        places = np.stack([self.truth["y_px"], self.truth["x_px"], step, amplitude], axis=1)
+        population = Population(float(np.median(amplitude)), max(float(np.log(amplitude).std()), 0.05))
+        return np.pad(places, ((0, 0), (0, self.model.modes_count))), population, 1
+
+
 def from_truth(frame: NDArray, model: PatternModel, truth: pd.DataFrame) -> pd.DataFrame:
-    """Table of the fit of all particles, of free amplitude, that starts where they are: what the images allow."""
-    slices, z_um = np.arange(model.count), model.z_um
-    height = field_terms(truth["x_px"], truth["y_px"], frame.shape) @ model.surface
-    step = np.interp(truth["z_um"], z_um, slices) + height
-    places = np.stack([truth["y_px"], truth["x_px"], step, truth["amplitude"]], axis=1)
-    renderer = Renderer(model.patterns, model.nodes_per_px, noise=model.noise, surface=model.surface)
-    weight, frame = np.full(frame.shape, model.noise**-2, np.float32), frame.astype(np.float32)
-    background, population = Background(frame.shape, model.size), Population(1.0, 10.0)
-    for _ in range(3):
-        fit = fitted(renderer, frame, places, weight, population=population, steps=3, surface=background)
-        places = fit.places
-        variance = learned_variance(fit.image, fit.residual, model.noise)
-        weight = variance.weight(fit.image, np.ones(frame.shape, bool))
-    y, x, step, amplitude = places.T[:4]
-    step = step - height
-    own = [np.interp(step, slices, values) for values in (model.own_error[:, 2], model.own_bias_um)]
-    z_std = np.hypot(fit.std[:, 2] * (z_um[1] - z_um[0]), own[0])
-    return pd.DataFrame(
-        {
-            "x_px": x,
-            "y_px": y,
-            "z_um": np.interp(step, slices, z_um) - own[1],
-            "z_std_um": z_std,
-            "amplitude": amplitude,
-        }
-    )
+    """Table of the joint fit that starts from the true particles."""
+    plan = FromTruth(model, frame.shape)
+    plan.truth = truth
+    return plan.table(plan.first(frame.astype(np.float32)))
 
 
 METHODS = {
