@@ -1,6 +1,17 @@
 """The model of a frame, fitted: a smooth background plus a sum of particles, all at once."""
 
-from gdptlab.fit.joint import Explained, Joint
-from gdptlab.fit.model import PatternModel
+import lazy_loader
 
-__all__ = ["Explained", "Joint", "PatternModel"]
+# Each module is imported when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "bounds": ["expected_error", "own_bias_um", "own_error"],
+        "frames": ["explained"],
+        "joint": ["Explained", "Joint"],
+        "learning": ["learned"],
+        "model": ["PatternModel", "field_terms"],
+        "pattern": ["particle_light"],
+        "plane": ["decided_by_plane"],
+    },
+)

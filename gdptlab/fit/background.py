@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from gdptlab.cores import compiled
+from gdptlab._compiled import compiled
 from gdptlab.fit.renderer import Columns
 
 BOUNDED = 3.0
@@ -120,7 +120,8 @@ def suitable(
     for surface in surfaces:
         smooth = cv2.GaussianBlur(residual - surface.fit(residual, weight), (0, 0), smooth_px)
         left.append(np.median(np.abs(smooth[weight > 0])))
-    if PRINT: print('      surfaces', np.array(left)/left[-1])
+    if PRINT:
+        print("      surfaces", np.array(left) / left[-1])
     return int(np.argmax(np.array(left) <= FINER * left[-1]))
 
 

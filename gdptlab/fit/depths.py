@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gdptlab.cores import compiled
+from gdptlab._compiled import compiled
 from gdptlab.fit.noise import Variance
 from gdptlab.fit.renderer import Renderer
 from gdptlab.fit.solver import FAINTEST, Fit

@@ -125,7 +125,12 @@ class Joint:
         modes = None if model.modes is None else model.modes / self._peak
         self._full = self._level(patterns, error, 1, threads, modes)
         half = reduced(patterns, fine)
-        error = np.ascontiguousarray(error[:, _even(error) :, _even(error) :][:, ::2, ::2][:, : half.shape[-1], : half.shape[-1]]) / 2
+        error = (
+            np.ascontiguousarray(
+                error[:, _even(error) :, _even(error) :][:, ::2, ::2][:, : half.shape[-1], : half.shape[-1]]
+            )
+            / 2
+        )
         self._small = self._level(half, error, scale, threads)
         self._blur = BLUR * model.size / scale
         self._sharp = self._level(high_passed(half, self._blur * fine), error, scale, threads)
@@ -331,7 +336,12 @@ class Joint:
         )
         rows, columns = self.shape
         inside = explained.stays & (y >= -0.5) & (y < rows - 0.5) & (x >= -0.5) & (x < columns - 0.5)
-        if EXTRA: table = table.assign(gain=explained.gain, excess=explained.excess, gain_fraction=fit.gain / np.maximum(fit.energy * amplitude**2 / 2, 1e-9))
+        if EXTRA:
+            table = table.assign(
+                gain=explained.gain,
+                excess=explained.excess,
+                gain_fraction=fit.gain / np.maximum(fit.energy * amplitude**2 / 2, 1e-9),
+            )
         table = table[inside].sort_values("cm", ascending=False, ignore_index=True)
         table.attrs |= {"saturated_px": explained.pixels.saturated, "defective_px": explained.pixels.defective}
         return table

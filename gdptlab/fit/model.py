@@ -14,10 +14,12 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter, median_filter
+from scipy.ndimage import gaussian_filter
 
 from gdptlab.calibration import Calibration
-from gdptlab.denoising import denoised, noise_level
+from gdptlab.denoising import noise_level
+from gdptlab.fit.bounds import own_bias_um, own_error, recalibration_errors
+from gdptlab.fit.pattern import continued, particle_light
 
 ALIKE = 0.85
 """Correlation of the patterns at two depths from which on the one may be taken for the other."""
@@ -83,9 +85,9 @@ class PatternModel:
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> Self:
         """Model of a calibration with one particle: one pattern, a node per pixel, flat focal surface, no modes."""
-        images = continued(calibration.images)
+        images = continued(particle_light(calibration))
         rim = (images.shape[-1] - calibration.size) // 2
-        errors = np.pad(remake_errors(calibration), ((0, 0), (0, 0), (rim, rim), (rim, rim)), mode="edge")
+        errors = np.pad(recalibration_errors(calibration), ((0, 0), (0, 0), (rim, rim), (rim, rim)), mode="edge")
         return cls(
             patterns=images[None],
             z_um=calibration.z_um,
@@ -93,8 +95,8 @@ class PatternModel:
             noise=noise_level(calibration.stack),
             size=calibration.size,
             pattern_error=error_density(errors, 1),
-            own_error=calibration.own_error,
-            own_bias_um=calibration.own_bias_um,
+            own_error=own_error(calibration),
+            own_bias_um=own_bias_um(calibration),
         )
 
     @property
@@ -143,35 +145,3 @@ def error_density(errors: NDArray, nodes_per_px: int) -> NDArray[np.float32]:
     smooth = gaussian_filter(errors, (0, 0, width, width), mode="nearest")
     variance = gaussian_filter(np.mean(np.square(smooth), axis=0), (2, 2 * width, 2 * width), mode="nearest")
     return (2 * np.sqrt(np.pi) * ERROR_SCALE_PX * np.sqrt(variance)).astype(np.float32)
-
-
-def remake_errors(calibration: Calibration, repeats: int = 4) -> NDArray[np.float32]:
-    """Errors (R, N, n, n) of the images of calibrations made again, with fresh noise like the stack's."""
-    truth = calibration.images.astype(np.float64)
-    light, rest = np.abs(truth), calibration.stack - denoised(calibration.stack)
-    per_count = max(np.polyfit(light.ravel(), rest.ravel() ** 2, 1)[0], 0)
-    noise = np.sqrt(noise_level(calibration.stack) ** 2 + per_count * light)
-    errors = []
-    for seed in range(repeats):
-        stack = truth + np.random.default_rng(seed).normal(0, noise, truth.shape)
-        errors.append(Calibration.from_stack(stack, calibration.z_um, n_sub=len(calibration.subset)).images - truth)
-    return np.array(errors, dtype=np.float32)
-
-
-def continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Images that go on beyond their frame: the light along each side falls on as a parabola about the middle does."""
-    half = images.shape[1] // 2
-    more, depth = 2 * (half // 3), max(half // 4, 2)
-    away = np.arange(-half - more, half + more + 1)
-    rim, fall = np.abs(away) > half, []
-    for axis in (1, 2):
-        light, factor = images.mean(axis=3 - axis), np.ones((len(images), len(away)), np.float32)
-        for side in (away[more : more + depth], away[-more - depth : -more]):
-            bend, middle = np.polyfit(side**2, light[:, side + half].T, 1)
-            end = np.where(bend * middle < 0, -middle / np.where(bend == 0, 1, bend), 0)
-            end = np.clip(median_filter(end, 5, mode="nearest")[:, None], (half + 1) ** 2, (half + more) ** 2)
-            beyond = rim & (away * side[0] > 0)
-            factor[:, beyond] = np.clip((end - away[beyond] ** 2) / (end - half**2), 0, 1)
-        fall.append(factor)
-    down, across = fall
-    return np.pad(images, ((0, 0), (more, more), (more, more)), mode="edge") * (down[:, :, None] * across[:, None, :])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import norm
 
-from gdptlab.cores import compiled
+from gdptlab._compiled import compiled
 from gdptlab.denoising import noise_level
 
 ALONE = 3.0

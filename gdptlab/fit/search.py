@@ -9,10 +9,11 @@ are explained, all of an image does.
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
-from gdptlab.cores import compiled
+from gdptlab._compiled import compiled
+from gdptlab.correlation import good_shape, times_conjugate
 from gdptlab.fit.solver import Population
-from gdptlab.spectra import good_shape, packed, smooth_power, times_conjugate
 
 DEPTHS = 13
 """About as many depths are searched; the fit finds those between."""
@@ -219,3 +220,18 @@ def _gain(maps, mix, cut, rows, columns, margin, centre, known, fraction, gain, 
             gain[i, margin + j] = value if value > half_of * least * (1 / per - known) else zero
             best[i, margin + j] = argument[j]
             bright[i, margin + j] = np.sqrt(highest[j] * per)  # c / (e + known)
+
+
+def smooth_power(spectrum: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """Power of a spectrum, (rows, columns / 2 + 1), smoothed over `sigma` frequency steps."""
+    squares = spectrum**2
+    inner = squares[:, 1:-1:2] + squares[:, 2:-1:2]
+    # The outermost columns are packed in another way; their neighbours stand in for them.
+    return gaussian_filter(np.pad(inner, ((0, 0), (1, 1)), mode="edge"), sigma, mode=("wrap", "nearest"))
+
+
+def packed(half: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Factors (rows, columns / 2 + 1) of a spectrum in OpenCV's order."""
+    out = np.repeat(half[:, 1:], 2, axis=1)
+    rows = (np.arange(len(half)) + 1) // 2
+    return np.column_stack([half[rows, 0], out[:, :-2], half[rows, -1]])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from gdptlab.cores import compiled
+from gdptlab._compiled import compiled
 from gdptlab.fit.background import Background
 from gdptlab.fit.renderer import Columns, Renderer
 
