@@ -20,8 +20,6 @@ from gdptlab import Calibration, batch, datasets
 from gdptlab.experiment import Method, errors, sweep
 from gdptlab.experiment.channel import Acoustics, Focusing
 from gdptlab.experiment.film import Film
-from gdptlab.fit.field_calibration import FieldCalibration
-from gdptlab.fit.over_field import locate_over_field
 from gdptlab.locate import locate
 from gdptlab.tracking.tracks import link, velocities
 
@@ -53,12 +51,6 @@ def joint(image_type: str) -> pd.DataFrame:
     return batch([frames[10], frames[11]], sample_calibration(image_type), method="joint", progress=False)
 
 
-def over_field() -> pd.DataFrame:
-    """A frame in `data/`, fitted with amplitudes free."""
-    calibration = FieldCalibration.from_one(sample_calibration("fluorescent"))
-    return locate_over_field(datasets.sample("fluorescent").frames[0], calibration)
-
-
 def replayed() -> pd.DataFrame:
     """Errors of the trigger times of one film, refined and not."""
     calibration = sample_calibration("fluorescent")
@@ -87,15 +79,14 @@ def beads_correlation() -> pd.DataFrame:
 def beads_over_field() -> pd.DataFrame:
     """A quarter of the field of the real beads, calibrated with all beads in it."""
     beads = datasets.planar_beads()
-    calibration = FieldCalibration.from_scan(beads.scan[::2, :288, :288], beads.z_um[::2], turns=1)
-    return locate_over_field(beads.frames[8, :288, :288], calibration)
+    calibration = Calibration.from_scan(beads.scan[::2, :288, :288], beads.z_um[::2], field=True)
+    return locate(beads.frames[8, :288, :288], calibration, method="joint")
 
 
 TABLES: dict[str, Callable[[], pd.DataFrame]] = {
     **{f"refined-{t}": lambda t=t: correlation(t, refine=True) for t in IMAGE_TYPES},
     **{f"unrefined-{t}": lambda t=t: correlation(t, refine=False) for t in IMAGE_TYPES},
     **{f"joint-{t}": lambda t=t: joint(t) for t in IMAGE_TYPES},
-    "over-field": over_field,
     "replay-errors": replayed,
     "velocities": tracked,
     "beads-correlation": beads_correlation,

@@ -28,9 +28,10 @@ POSITION_PX = ["x_px", "y_px", "z_um"]
 """Columns of a position in a table that has no µm in the plane."""
 
 OUTSIDE = 0.1
-"""Largest fraction of positions that may lie outside a channel, by more than the search range. Chosen: errors of
-measurement put hardly any there (0 of the sample films' tables), but a table whose origin is the first pixel, not the
-channel's middle, has half or more of its positions there."""
+"""Largest fraction of positions that may lie outside a channel, by more than the search range. Chosen on a second of
+the paper's experiment, measured by correlation: none of 698 positions from the channel's middle lie there, 86 % of
+those from the first pixel. Larger, a table with another origin passes if its flow is in part of the frame; smaller,
+false finds stop the user."""
 
 LEAST_ROWS = 5
 """Least number of positions in a window from which a velocity is fitted. Derived: a parabola has three coefficients,
