@@ -37,7 +37,8 @@ the correlation's z of the dimmest particles, by 1 µm (400 counts) to 4 µm (10
 PERIOD_PX = (1024.0, 768.0)
 """Periods, px, of the sinusoid in a disturbed image along x and y: a frame of 512 x 512 px shows half of one and two
 thirds of the other. The paper gives none. Chosen with `AMPLITUDE`: at half of these periods the correlation loses
-isolated particles, at a quarter the joint fit is off by 2.5 µm in z; much longer ones are slopes, which the templates do not see."""
+isolated particles, at a quarter the joint fit is off by 2.5 µm in z; much longer ones are slopes, which the templates
+do not see."""
 
 
 def fluorescent(light: NDArray) -> NDArray:
