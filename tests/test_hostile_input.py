@@ -245,7 +245,7 @@ def test_choose_settings(frames, given):
     names = ("frames", "image", "threshold", "method", "refine", "min_distance_px")
     chosen = fails_by_name(lambda: choose_settings(frames, CALIBRATION, **given), *names)
     if chosen is not None:
-        assert 0 < chosen.threshold <= 1 and np.isfinite(chosen.ghosts.astype(float)).all(axis=None)
+        assert 0 < chosen.threshold <= 1 and np.isfinite(chosen.side_lobes.astype(float)).all(axis=None)
 
 
 # -------------------- tables

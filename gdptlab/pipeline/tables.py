@@ -151,8 +151,8 @@ def save_points(
     scale = 1.0 if um_per_px is None else check.positive("um_per_px", um_per_px)
     frame = table["frame"] if "frame" in table else pd.Series(0, table.index)
     if program == "napari":
-        place = [scale * table["y_px"], scale * table["x_px"]]
-        axes = [frame, *([] if um_per_px is None else [table["z_um"]]), *place]
+        position = [scale * table["y_px"], scale * table["x_px"]]
+        axes = [frame, *([] if um_per_px is None else [table["z_um"]]), *position]
         points = {f"axis-{i}": axis for i, axis in enumerate(axes)}
         points |= {name: table[name].astype(float) for name in table if table[name].dtype.kind in "buif"}
         name_of_row, first = "index", 0

@@ -55,8 +55,8 @@ def mean_field(
     edges = {axis: _edges(table[axis], cell, axis) for axis, cell in cells.items()}
     shape = [len(edge) - 1 for edge in edges.values()]
     where = [_cell(table[axis].to_numpy(dtype=float), edge) for axis, edge in edges.items()]
-    inside = np.all([place >= 0 for place in where], axis=0) & np.isfinite(table[values].astype(float)).all(axis=1)
-    cell = np.ravel_multi_index([place[inside] for place in where], shape)
+    inside = np.all([number >= 0 for number in where], axis=0) & np.isfinite(table[values].astype(float)).all(axis=1)
+    cell = np.ravel_multi_index([number[inside] for number in where], shape)
     value = table.loc[inside, values].to_numpy(dtype=float)
     number = table["particle"] if "particle" in table else pd.Series(np.arange(len(table)), table.index)
     n, n_particles, mean, error = _clustered(cell, pd.factorize(number[inside])[0], value, int(np.prod(shape)))
@@ -85,9 +85,9 @@ def _edges(column: pd.Series, cells: int | ArrayLike, axis: str) -> NDArray[np.f
 
 def _cell(values: NDArray, edges: NDArray) -> NDArray[np.int64]:
     """Number of the cell that each value (n,) lies in; -1 outside, and for NaN."""
-    place = np.searchsorted(edges, values, side="right") - 1
-    place[values == edges[-1]] = len(edges) - 2
-    return np.where((values >= edges[0]) & (values <= edges[-1]), place, -1)
+    number = np.searchsorted(edges, values, side="right") - 1
+    number[values == edges[-1]] = len(edges) - 2
+    return np.where((values >= edges[0]) & (values <= edges[-1]), number, -1)
 
 
 def _clustered(
