@@ -34,8 +34,8 @@ def recorded(rng, image):
 def folder(tmp_path_factory):
     """Scan and film of a vortex about a vertical axis, as TIFF files, and the film's truth."""
     path, rng = tmp_path_factory.mktemp("images"), np.random.default_rng(1)
-    grid = np.stack(np.meshgrid(np.arange(40, 240, 60), np.arange(40, 240, 60)), axis=-1).reshape(-1, 2)
-    places, shape = grid + rng.uniform(-6, 6, grid.shape), (240, 240)
+    grid = np.stack(np.meshgrid(*2 * [np.arange(40, 200, 60)]), axis=-1).reshape(-1, 2)
+    places, shape = grid + rng.uniform(-6, 6, grid.shape), (200, 200)
     (path / "scan").mkdir()
     for z in DEPTHS:
         image = recorded(rng, sum(bead(z, *place, shape) for place in places))
@@ -46,7 +46,7 @@ def folder(tmp_path_factory):
         angle = phase + 1.5 * k / RATE
         here = pd.DataFrame({"frame": k, "x_px": 120 + radius * np.cos(angle), "y_px": 118 + radius * np.sin(angle)})
         true.append(here.assign(z_um=z))
-        frames.append(recorded(rng, sum(bead(p.z_um, p.x_px, p.y_px, shape) for p in true[-1].itertuples())))
+        frames.append(recorded(rng, sum(bead(p.z_um, p.x_px, p.y_px, (240, 240)) for p in true[-1].itertuples())))
     resolution = {"resolution": (1 / UM_PER_PX,) * 2, "metadata": {"unit": "um", "axes": "TYX"}}
     tifffile.imwrite(path / "film.tif", np.stack(frames), imagej=True, **resolution)
     pd.concat(true, ignore_index=True).to_csv(path / "true.csv", index=False)

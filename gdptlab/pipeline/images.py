@@ -69,7 +69,7 @@ class Images(Sequence):
         frame: tuple[tuple[int, int], np.dtype],
         um_per_px: float | None,
     ) -> None:
-        # A row of locations is the number of a file, and where in it an image is described or, if the file is raw, begins.
+        # A row of locations: number of a file, and where in it an image is described or, if the file is raw, begins.
         used, number_of_file = np.unique(locations[:, 0], return_inverse=True)
         self._files = [files[i] for i in used]
         self._locations = np.stack([number_of_file, locations[:, 1]], axis=1)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gdptlab._checks import positive, real_array, whole
 from gdptlab._checks import table as check_table
-from gdptlab.tracking.tracks import positions_of
+from gdptlab.tracking.tracks import must_be_tracks, positions_of
 
 
 def mean_field(
@@ -48,9 +48,13 @@ def mean_field(
     check_table("table", table, ())
     if values is None:
         values = [name for name in (f"v{a}_{unit}_s" for a in "xyz" for unit in ("um", "px")) if name in table]
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise TypeError(f"values: got {values!r}, allowed is a list of columns")
     values = list(values)
     if not values:
         raise ValueError("values: got none, and table has no velocities, needed is a column or more")
+    if set(cells) & set(values):
+        raise ValueError(f"values: got {values}, some of which are axes of the grid, allowed are others")
     check_table("table", table, [*cells, *values])
     edges = {axis: _edges(table[axis], cell, axis) for axis, cell in cells.items()}
     shape = [len(edge) - 1 for edge in edges.values()]
@@ -134,7 +138,7 @@ def mean_squared_displacement(tracks: pd.DataFrame, frame_rate_hz: float, *, lon
     TypeError, ValueError
         If an argument is not of that form, a column is missing, or no track has two rows.
     """
-    check_table("tracks", tracks, ["frame", "particle"])
+    must_be_tracks(tracks)
     columns, rate = positions_of("tracks", tracks), positive("frame_rate_hz", frame_rate_hz)
     if not tracks.duplicated("particle").any():
         raise ValueError("tracks: got none of two or more rows, needed is one")
