@@ -40,9 +40,7 @@ def test_samples_fit_their_truth(image_type):
 
 
 def test_unknown_sample():
-    with pytest.raises(
-        ValueError, match=r"^image_type: got 'dark', allowed are 'fluorescent', 'brightfield', 'disturb"
-    ):
+    with pytest.raises(ValueError, match=r"^image_type: .*'dark'"):
         datasets.sample("dark")
 
 
