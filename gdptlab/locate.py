@@ -82,11 +82,10 @@ def locate(
         A row for each particle, highest C_m first. `x_px` to the right and `y_px` down, the first pixel's
         centre at (0, 0); `z_um` in the depths of the calibration; `cm`, the correlation with the best image;
         `at_end`, whether that is the stack's first or last image, so that z may lie beyond it. With
-        "joint" `z_um` is less `Calibration.own_bias_um`, and there are also `x_std_px`, `y_std_px` and `z_std_um`,
-        standard deviations (noise of the frame and of the calibration, neighbours considered; wider for a
-        particle unlike the others in amplitude); `amplitude`, 1 for that of the calibration's particle; and
-        `chi2`, the mean square of what is left around the particle, in units of the noise: well above 1 for
-        what is no particle of this kind.
+        "joint" `z_um` is less the calibration's own bias (`fit.own_bias_um`), and there are also `x_std_px`,
+        `y_std_px` and `z_std_um`, standard deviations; `amplitude`, 1 for the calibration's particle; `chi2`, the mean
+        square of the residual around the particle over its variance, well above 1 for what is no particle of this kind;
+        and the columns that `fit.Joint.table` names.
 
     Raises
     ------
@@ -106,7 +105,7 @@ def locate(
     if choice("method", method, METHODS) == "joint":
         if threshold is not None or not flag("refine", refine) or min_distance_px is not None:
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
-        from gdptlab.fit.joint import explained
+        from gdptlab.fit.frames import explained
 
         return explained(image, calibration)[0]
     threshold = THRESHOLD if threshold is None else threshold
@@ -275,7 +274,7 @@ def in_blocks(
     before a missing block is measured once more; otherwise blocks know nothing of each other.
     """
     if settings.get("method") == "joint":
-        from gdptlab.fit.joint import explained
+        from gdptlab.fit.frames import explained
 
         before = None
         for first, block in _blocks(frames, ()):

@@ -53,7 +53,7 @@ def test_only_beads_alone_are_used(made) -> None:
 
 def test_average_has_less_noise_than_a_bead(scan, made) -> None:
     one = Calibration.from_bead(scan, Z_UM, *PLACES[0], size=made.size)
-    assert made.own_error[:, 2].mean() < 0.75 * one.own_error[:, 2].mean()
+    assert made.model.own_error[:, 2].mean() < 0.75 * one.model.own_error[:, 2].mean()
 
 
 def test_what_is_given_is_used(scan) -> None:

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import CALIBRATION_SEED, IMAGE_TYPES, Z_UM, table
+from conftest import CALIBRATION_SEED, Z_UM, table
 from references import correlate_plainly
 
 from gdptlab import Calibration, locate
@@ -473,69 +473,6 @@ def test_three_slices_are_enough(clean_stack):
 def test_a_calibration_cannot_be_changed(calibration):
     with pytest.raises(AttributeError):
         calibration.z_um = pd.Series(Z_UM)
-
-
-# -------------------- the particle's own light, and how well it is known
-
-LIGHT_COUNTS = {True: 1.0, False: 6.0}  # mean error of the light of an image, without and with noise of 38 counts
-
-
-@pytest.mark.parametrize("kind", ["clean", *IMAGE_TYPES])
-def test_images_are_the_light_without_background(clean_stack, calibrations, kind):
-    """Bright on nothing for particles on a dark field, dark on nothing for those on a bright one."""
-    made = Calibration.from_stack(clean_stack, Z_UM) if kind == "clean" else calibrations[kind]
-    light = (clean_stack - 500.0) * (1 if kind in ("clean", "fluorescent") else -1)
-    assert made.images.shape == light.shape and made.images.dtype == np.float32
-    off = made.images - light
-    budget = LIGHT_COUNTS[kind == "clean"]
-    assert abs(off.mean()) < budget
-    assert np.abs(off.mean(axis=(1, 2))).max() < 4 * budget
-    assert np.sqrt((off**2).mean()) < 2 * budget + 0.004 * np.abs(light).max()
-    assert distance(np.abs(made.images), np.abs(light)).max() < 0.05
-
-
-def test_images_do_not_know_the_level(stacks):
-    """Nor a slope of the light behind the particle."""
-    stack = stacks["fluorescent"].astype(np.float64)
-    y, x = np.indices(stack.shape[1:])
-    expected = Calibration.from_stack(stack, Z_UM).images
-    np.testing.assert_allclose(Calibration.from_stack(stack + 3000, Z_UM).images, expected, atol=0.5)
-    sloped = Calibration.from_stack(stack + 0.4 * x - 0.2 * y, Z_UM).images
-    assert np.sqrt(((sloped - expected) ** 2).mean()) < 2
-
-
-@pytest.mark.parametrize("n", [3, 4, 6, 11])
-def test_images_of_few(stacks, n):
-    made = Calibration.from_stack(stacks["brightfield"], Z_UM, n=n, n_sub=2)
-    assert made.images.shape == (n, 61, 61) and np.isfinite(made.images).all()
-    assert made.own_error.shape == (n, 3) and np.isfinite(made.own_error).all()
-
-
-def test_own_error_is_that_of_the_noise(microscope, clean_stack, calibration):
-    """It shrinks with the noise of the stack, and is the same each time."""
-    light, rng = clean_stack - 500.0, np.random.default_rng(95)
-    light = light[::2]
-    errors = [Calibration.from_stack(light + rng.normal(0, s, light.shape), Z_UM[::2]).own_error for s in (3, 12, 48)]
-    for error in errors:
-        assert error.shape == (26, 3) and (error > 0).all()
-    sizes = np.sqrt(np.mean(np.square(errors), axis=1))
-    assert (sizes[1] > 1.5 * sizes[0]).all() and (sizes[2] > 1.5 * sizes[1]).all()
-    again = Calibration.from_stack(calibration.stack, Z_UM)
-    np.testing.assert_array_equal(again.own_error, calibration.own_error)
-
-
-def test_images_at_the_resolution_of_the_search(calibration, clean_stack):
-    """Every second pixel, the middle one again in the middle; images as they are where the search is not halved."""
-    assert calibration.half_resolution
-    small = calibration.at_search_resolution(calibration.images)
-    assert small.shape[1] % 2 == 1 and small.shape[1] in (29, 31)
-    middle = calibration.images[30, 30, 30], small[30, small.shape[1] // 2, small.shape[1] // 2]
-    assert middle[1] == pytest.approx(middle[0], rel=0.15)
-    symmetric = small[:, ::-1, ::-1]
-    assert np.abs(small - symmetric).mean() < 0.05 * np.abs(small).mean() + 10
-    fine = Calibration.from_stack(np.random.default_rng(96).random((5, 9, 9)), range(5), n_sub=2, denoise=False)
-    assert not fine.half_resolution
-    assert fine.at_search_resolution(fine.stack) is fine.stack
 
 
 # -------------------- plans

@@ -28,11 +28,12 @@ ALLOWED = {
 
 DOORS = {
     ("locate", "fit"),
+    ("calibration", "fit"),
     ("calibration", "pipeline"),
     ("pipeline/measuring", "tracking"),
     ("pipeline/measuring", "plots"),
 }
-"""Modules that may open a room above, in a function: for `method="joint"`, calibrations from scans, tracks, pages."""
+"""Modules that may open a room above, in a function: for the joint fit, calibrations from scans, tracks and pages."""
 
 ONE_MODULE = {("tracking/acoustic_energy", "experiment")}
 """Modules that may import a room that the rest of their own may not."""

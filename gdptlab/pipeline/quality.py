@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from gdptlab._checks import positive
 from gdptlab.calibration import Calibration
 from gdptlab.denoising import noise_level, signal_to_noise
+from gdptlab.fit.bounds import expected_error
 
 AMBIGUOUS = 0.95
 """Correlation from which on the images of two depths are mistaken for each other. Chosen between 0.9 and 0.99 on the
@@ -74,7 +75,7 @@ def depth_quality(calibration: Calibration, noise: float | None = None) -> pd.Da
     -------
     DataFrame
         A row for each image: `z_um`; `signal_to_noise`, its height over the noise of a pixel; `z_std_um`, the least
-        error of z in such frames (`Calibration.expected_error`); `own_error_um`, what the stack's noise
+        error of z in such frames (`fit.expected_error`); `own_error_um`, what the stack's noise
         adds to it at every particle; `next_correlation`, the correlation with the next image; and of the image with the
         highest correlation among those that are not just neighbours its correlation `ambiguous_correlation` and depth
         `ambiguous_um` (NaN if there is none).
@@ -90,8 +91,8 @@ def depth_quality(calibration: Calibration, noise: float | None = None) -> pd.Da
         {
             "z_um": z_um,
             "signal_to_noise": signal_to_noise(calibration.stack) * own_noise / noise,
-            "z_std_um": calibration.expected_error(noise)["z_std_um"],
-            "own_error_um": calibration.own_error[:, 2],
+            "z_std_um": expected_error(calibration, noise=noise)["z_std_um"],
+            "own_error_um": calibration.model.own_error[:, 2],
             "next_correlation": following,
             "ambiguous_correlation": np.where(none, np.nan, correlation[each, other]),
             "ambiguous_um": np.where(none, np.nan, z_um[other]),

@@ -26,7 +26,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "save_animation",
         ],
         "figure5": ["error_against_tau", "fig5_settings", "fig5_times"],
-        "frames": ["contact_sheet", "frame_with_particles", "particles_3d", "side_by_side"],
+        "frames": ["circled", "contact_sheet", "draw_in_space", "frame_with_particles", "particles_3d", "side_by_side"],
         "knobs": ["panel", "slide"],
         "limits": ["biases", "errors_against_bound", "expected_errors"],
         "live": ["latencies", "live_panel", "loop_and_timer", "one_loop", "watch_live"],
@@ -34,7 +34,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "overlap": ["REACH", "error_ratios", "film_followed", "found_and_left", "laid_bare"],
         "quality": ["calibration_page", "depth_against_truth", "measured_page", "symptoms"],
         "speed": ["breakdown", "frame_times", "real_time", "scaling"],
-        "style": ["COLOURS", "FIGURES", "extent", "folder", "save", "use"],
+        "style": ["COLOURS", "FIGURES", "bare", "depth_label", "extent", "folder", "save", "use"],
         "tracks": [
             "collapsed_paths",
             "energy_intervals",

@@ -49,7 +49,7 @@ def calibration_quality(calibration: Calibration) -> Figure:
     return figure
 
 
-def expected_profiles(figure: Figure | SubFigure, calibration: Calibration, um_per_px: float) -> None:
+def expected_profiles(figure: Figure | SubFigure, calibration: Calibration) -> None:
     """Draw (a): the stack, the subset taken from it, and the C_m profile that is expected at each depth.
 
     Parameters
@@ -57,25 +57,26 @@ def expected_profiles(figure: Figure | SubFigure, calibration: Calibration, um_p
     figure : Figure or SubFigure
         To draw on.
     calibration : Calibration
-    um_per_px : float
-        Size of a pixel in the object.
     """
     z_um, subset, stack = calibration.z_um, calibration.subset, calibration.stack
     shown = np.unique(np.linspace(0, len(stack) - 1, min(len(stack), 17)).astype(int))
     upper, lower = figure.subfigures(2, 1, height_ratios=[1, 1.9])
     strips = upper.subplots(2, max(len(shown), len(subset)), squeeze=False)
-    for strip, chosen, colour in zip(strips, (shown, subset), ("0.6", MARK), strict=True):
-        for panel in strip:
-            bare(panel)
-        for panel, k in zip(strip, chosen, strict=False):
+    below = np.rint(subset * (len(shown) - 1) / (len(stack) - 1)).astype(int)  # each under the slice it is taken from
+    if len(np.unique(below)) < len(subset):
+        below = np.arange(len(subset))
+    for panel in strips.flat:
+        bare(panel)
+    for strip, chosen, columns, colour in (
+        (strips[0], shown, np.arange(len(shown)), "0.6"),
+        (strips[1], subset, below, MARK),
+    ):
+        for panel, k in zip(strip[columns], chosen, strict=True):
             panel.imshow(stack[k])
             panel.set_title(depth_label(z_um[k]), loc="center", fontsize="small", pad=2)
             panel.spines[:].set(visible=True, color=colour, linewidth=1.5)
-        for panel in strip[len(chosen) :]:
-            panel.set_visible(False)
     strips[0, 0].set_ylabel(f"stack,\nN = {len(stack)}", fontsize="small")
     strips[1, 0].set_ylabel(f"subset,\n$N_{{sub}}$ = {len(subset)}", fontsize="small", color=MARK)
-    scale_bar(strips[1, 0], um_per_px, 10)
 
     map_, rows = lower.subplots(1, 2)
     low, high, *_ = extent(z_um)

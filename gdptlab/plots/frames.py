@@ -55,7 +55,11 @@ def frame_with_particles(
 
 
 def circled(
-    axes: Axes, image: NDArray, particles: pd.DataFrame, z_limits_um: tuple[float, float], area: float = 330
+    axes: Axes,
+    image: NDArray,
+    particles: pd.DataFrame,
+    z_limits_um: tuple[float, float] = (-50, 50),
+    area: float = 330,
 ) -> PathCollection:
     """Draw a frame and a circle, coloured by z, round each of its particles."""
     axes.imshow(image, **grey(image))
@@ -70,12 +74,33 @@ def circled(
     return circles
 
 
+def draw_in_space(
+    axes: Axes,
+    particles: pd.DataFrame,
+    um_per_px: float,
+    z_limits_um: tuple[float, float] = (-50, 50),
+    true: pd.DataFrame | None = None,
+) -> PathCollection:
+    """Draw particles in space, to scale, on axes with the projection "3d"; true ones, if given, as crosses."""
+    if true is not None:
+        x, y = true["x_px"] * um_per_px, true["y_px"] * um_per_px
+        axes.scatter(x, y, true["z_um"], marker="x", color="0.35", s=22, lw=1, depthshade=False, label="true")
+    x, y, z = particles["x_px"] * um_per_px, particles["y_px"] * um_per_px, particles["z_um"]
+    low, high = z_limits_um
+    dots = axes.scatter(x, y, z, c=z, cmap=DEPTH, vmin=low, vmax=high, s=42, depthshade=False, label="measured")
+    axes.set(xlabel="x (µm)", ylabel="y (µm)", zlabel="z (µm)", zlim=z_limits_um)
+    axes.set(zticks=np.linspace(low, high, 3))
+    axes.yaxis.set_inverted(True)  # as in the image
+    spans = [np.diff(limits).item() for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    axes.set_box_aspect(np.abs(spans), zoom=0.92)
+    return dots
+
+
 @styled
 def particles_3d(
     particles: pd.DataFrame,
     um_per_px: float,
     *,
-    z_limits_um: tuple[float, float] = (-50, 50),
     true: pd.DataFrame | None = None,
     elevation: float = 24,
     azimuth: float = -62,
@@ -88,7 +113,6 @@ def particles_3d(
         Columns `x_px`, `y_px`, `z_um`.
     um_per_px : float
         Size of a pixel in the object.
-    z_limits_um : (float, float)
     true : DataFrame, optional
         True particles, drawn as crosses.
     elevation, azimuth : float
@@ -100,28 +124,7 @@ def particles_3d(
     """
     figure = plt.figure(figsize=(6.8, 4.4), layout="constrained")
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
-    if true is not None:
-        x, y = true["x_px"] * um_per_px, true["y_px"] * um_per_px
-        axes.scatter(x, y, true["z_um"], marker="x", color="0.35", s=22, lw=1, depthshade=False, label="true")
-    x, y = particles["x_px"] * um_per_px, particles["y_px"] * um_per_px
-    low, high = z_limits_um
-    dots = axes.scatter(
-        x,
-        y,
-        particles["z_um"],
-        c=particles["z_um"],
-        cmap=DEPTH,
-        vmin=low,
-        vmax=high,
-        s=42,
-        depthshade=False,
-        label="measured",
-    )
-    axes.set(xlabel="x (µm)", ylabel="y (µm)", zlabel="z (µm)", zlim=z_limits_um)
-    axes.set(zticks=np.linspace(low, high, 3))
-    axes.yaxis.set_inverted(True)  # as in the image
-    spans = [np.diff(limits).item() for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
-    axes.set_box_aspect(np.abs(spans), zoom=0.92)
+    dots = draw_in_space(axes, particles, um_per_px, true=true)
     axes.view_init(elev=elevation, azim=azimuth)
     figure.colorbar(dots, label="z (µm)", shrink=0.6, pad=0.08)
     if true is not None:

@@ -54,7 +54,9 @@ STYLE = {
 
 
 def use() -> None:
-    """Set the common style for pictures that a notebook draws itself."""
+    """Set the common style for pictures that a notebook draws itself, in the cell that draws them."""
+    # Loads the notebook's backend. If `styled` were the first to load it, what it sets would be lost with the style.
+    plt.switch_backend(plt.get_backend())
     plt.rcParams.update(STYLE)
 
 
