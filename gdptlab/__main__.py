@@ -55,6 +55,7 @@ def execute(notebook: Path) -> str:
     cell = 0
 
     def count(cell_index: int, **_: object) -> None:
+        """Note which cell is executed."""
         nonlocal cell
         cell = cell_index + 1
 
@@ -94,6 +95,7 @@ def run(notebooks: Sequence[Path], figures: Path) -> pd.DataFrame:
     """
 
     def files() -> set[tuple[str, int]]:
+        """Names of the figures, and when they were written (ns)."""
         return {(file.name, file.stat().st_mtime_ns) for file in figures.glob("[!.]*")}
 
     rows = []

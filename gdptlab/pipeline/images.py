@@ -518,7 +518,10 @@ def _errors_raised(logger: logging.Logger) -> Iterator[None]:
     """Raise what is logged as an error: tifffile only logs that a file is cut off, and returns what is left."""
 
     class Raising(logging.Handler):
+        """Handler that raises."""
+
         def emit(self, record: logging.LogRecord) -> None:
+            """Raise ValueError with what is logged."""
             raise ValueError(record.getMessage())
 
     handler = Raising(logging.ERROR)

@@ -121,29 +121,15 @@ def choose_settings(
     """
     if positive("false_fraction", false_fraction) >= 1:
         raise ValueError(f"false_fraction: got {false_fraction}, allowed is above 0 and below 1")
-    if threshold is not None and positive("threshold", threshold) > 1:
-        raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
-    if method is not None:
-        choice("method", method, METHODS)
     given = {"threshold": threshold, "refine": refine, "min_distance_px": min_distance_px}
     given = {name: value for name, value in given.items() if value is not None}
-    if method == "joint" and given:
-        raise ValueError(f"{', '.join(given)}: got one with method 'joint', which has none of them")
+    _must_go_together(method, given)
     whole("looked_at", looked_at, 1, 10_000)
     looked = [image_array("image", frame, 2) for frame in _spread(frames, looked_at)]
     if not looked:
         raise ValueError("frames: got none, needed is one or more")
     others = {name: value for name, value in given.items() if name != "threshold"}
-    found, false = (
-        pd.concat(
-            [
-                locate(sign * frame, calibration, threshold=LOWEST, **others).assign(frame=i)
-                for i, frame in enumerate(looked)
-            ],
-            ignore_index=True,
-        )
-        for sign in (1, -1)
-    )
+    found, false = (_found([sign * frame for frame in looked], calibration, others) for sign in (1, -1))
     side_lobes, alone = _side_lobes(calibration, noise_level(looked[0]), others)
     reasons = {"refine": "the whole stack is walked", "min_distance_px": "a quarter of a template"}
     if threshold is None:
@@ -175,6 +161,22 @@ def _spread(frames: Iterable[ArrayLike], n: int) -> list[ArrayLike]:
         return list(islice(frames, n))
     except TypeError as error:
         raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+
+
+def _must_go_together(method: str | None, given: dict[str, object]) -> None:
+    """Raise TypeError or ValueError unless the given settings belong to the given method."""
+    if method is not None:
+        choice("method", method, METHODS)
+    if positive("threshold", given.get("threshold", 1.0)) > 1:
+        raise ValueError(f"threshold: got {given['threshold']}, allowed is above 0 and at most 1")
+    if method == "joint" and given:
+        raise ValueError(f"{', '.join(given)}: got one with method 'joint', which has none of them")
+
+
+def _found(frames: list[NDArray], calibration: Calibration, settings: dict[str, object]) -> pd.DataFrame:
+    """What correlation finds in frames (rows, columns) from a C_m of `LOWEST` on."""
+    tables = [locate(frame, calibration, threshold=LOWEST, **settings) for frame in frames]
+    return pd.concat([table.assign(frame=i) for i, table in enumerate(tables)], ignore_index=True)
 
 
 def _above(cm: pd.Series, threshold: float) -> int:
