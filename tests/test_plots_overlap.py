@@ -4,9 +4,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
-from gdptlab.plots.figures import COLOURS
 
 from gdptlab import plots
+from gdptlab.plots.style import COLOURS
 
 
 @pytest.fixture(autouse=True)

@@ -4,11 +4,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
-from gdptlab.plots.figures import MARK
 
 from gdptlab import plots
 from gdptlab.experiment.channel import Acoustics, Channel, Focusing
 from gdptlab.experiment.film import Film
+from gdptlab.plots.style import MARK
 
 FPS = 25.0
 

@@ -265,7 +265,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             tables.append(table[(name != "later") | (table["t_s"] >= EARLY_S)].assign(part=name))
     timed = times(options.frames_timed)
     card = {
-        "command": " ".join(["python -m gdptlab sweep", *(sys.argv[1:] if arguments is None else arguments)]),
+        "command": f"python -m gdptlab sweep --films {options.films} --films-plain {films['plain']}"
+        f" --every {options.every}",
         "date": started.date().isoformat(),
         "minutes": round((datetime.now(UTC) - started).total_seconds() / 60, 1),
         "films": films,
