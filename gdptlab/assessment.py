@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import KDTree
 
 from gdptlab._checks import LARGEST, number, positive, real_array
 from gdptlab._checks import table as check_table
@@ -66,6 +65,8 @@ def match(
 
 
 def _match_frame(measured: pd.DataFrame, true: pd.DataFrame, within_px: float, within_um: float) -> pd.DataFrame:
+    from scipy.spatial import KDTree  # here, as it takes longer to import than all else of the package
+
     measured, true = (t.loc[(t[list(AXES.values())].abs() <= LARGEST).all(axis=1)] for t in (measured, true))
     here, there = (t[list(AXES.values())].to_numpy(dtype=float) for t in (measured, true))
     # In units of what is allowed, a pair is allowed if no difference is above 1.

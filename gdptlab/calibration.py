@@ -5,6 +5,7 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 """
 
 import os
+import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,24 +13,21 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import make_smoothing_spline
-from scipy.ndimage import uniform_filter1d
 
-from gdptlab._checks import depths, flag, positive, real_array, whole
+from gdptlab._checks import depths, flag, image_array, whole
 from gdptlab._compiled import on_one_core
 from gdptlab._files import written_whole
 from gdptlab._plans import planned
 from gdptlab.correlation import Correlator, normalised
-from gdptlab.denoising import denoised, noise_level
+from gdptlab.denoising import denoised
 from gdptlab.refinement import Displacement
 
 VERSION = 1
 """Of the file format of `Calibration.save`."""
 
-REPEATS = 4
-"""Of making the calibration again, to see what noise does to it."""
+PARTS = {"stack": 3, "z_um": 1, "subset": 1, "templates": 3}
+"""Arrays in the file of `Calibration.save`, and how many axes each has."""
 
 LOSSLESS = 0.98
 """Templates that keep this correlation with themselves at half resolution are searched for there."""
@@ -49,6 +47,8 @@ class Calibration:
         Indices of the stack images that frames are correlated with.
     templates : float32 array (N, n, n)
         The stack, denoised, each image with mean 0 and norm 1.
+    learned : PatternModel, optional
+        Patterns that `from_scan` learned from all beads of a scan at once, which the joint fit then draws with.
     report : ScanReport, optional
         How `from_scan` came to this calibration.
     """
@@ -57,6 +57,7 @@ class Calibration:
     z_um: NDArray[np.float64]
     subset: NDArray[np.int64]
     templates: NDArray[np.float32]
+    learned: Any = None
     report: Any = None
 
     @classmethod
@@ -93,7 +94,7 @@ class Calibration:
             If the stack or z_um are not of that form, hold NaN, or an image is constant; if n or n_sub is out
             of range.
         """
-        stack, z_um = real_array("stack", stack, 3), depths("z_um", z_um)
+        stack, z_um = image_array("stack", stack, 3), depths("z_um", z_um)
         if stack.shape[1] != stack.shape[2] or stack.shape[1] % 2 == 0:
             raise ValueError(f"stack: got images of {stack.shape[1:]} px, allowed are square ones of odd size")
         if len(stack) < 3:
@@ -177,6 +178,8 @@ class Calibration:
         beads_px: ArrayLike | None = None,
         size: int | None = None,
         n_sub: int | None = None,
+        field: bool = False,
+        modes: int = 0,
     ) -> Self:
         """Calibrate with a scan of full frames: beads, size of the templates and subset are found in the scan.
 
@@ -194,6 +197,12 @@ class Calibration:
         n_sub : int, optional
             Images that frames are correlated with. If not given, as many as it takes for an image at any depth to be
             like one of them.
+        field : bool
+            For the joint fit: learn from all beads of the scan how images change over the field, and the focal surface.
+            Frames must then have the shape of the scan.
+        modes : int
+            For the joint fit: learn from all beads of the scan in how many ways their images differ (by size, say), so
+            that a particle may differ as they do. About eight beads are needed for each.
 
         Returns
         -------
@@ -208,7 +217,15 @@ class Calibration:
         """
         from gdptlab.pipeline.beads import averaged_beads
 
-        return averaged_beads(scan, z_um, beads_px=beads_px, size=size, n_sub=n_sub)
+        calibration = averaged_beads(scan, z_um, beads_px=beads_px, size=size, n_sub=n_sub)
+        if not flag("field", field) and whole("modes", modes, 0, 100) == 0:
+            return calibration
+        from gdptlab.fit.learning import learned
+
+        beads = calibration.report.beads[["x_px", "y_px"]].to_numpy()
+        order = np.argsort(z_um)
+        model, _ = learned(np.asarray(scan)[order], calibration.z_um, beads, calibration.size, field=field, modes=modes)
+        return replace(calibration, learned=model)
 
     def __len__(self) -> int:
         return len(self.stack)
@@ -239,127 +256,14 @@ class Calibration:
         """Templates at the resolution of the search, (N, m, m), each with mean 0 and norm 1."""
         return normalised(_halved(self.templates)) if self.half_resolution else self.templates
 
-    def at_search_resolution(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Images (k, n, n) at the resolution of the search, the middle pixel again in the middle."""
-        return _halved(images) if self.half_resolution else images
-
     @cached_property
-    def images(self) -> NDArray[np.float32]:
-        """The particle's own light, (N, n, n): the stack, denoised, less its background, in the stack's counts.
+    def model(self) -> Any:
+        """What the joint fit draws particles with: `learned`, or else a `fit.PatternModel` of this one particle."""
+        if self.learned is not None:
+            return self.learned
+        from gdptlab.fit.model import PatternModel
 
-        Templates have no level and no slope; here both are put back, smooth in z as the light itself, but for the
-        background, which is that of the images whose outermost pixels are faintest (most bright, for dark
-        particles): there the particle is smallest.
-        """
-        flat = self.templates.reshape(len(self), -1)
-        strength = np.einsum("kp,kp->k", levelled(self.stack).reshape(len(self), -1), flat)
-        if len(self) >= 5:
-            strength = make_smoothing_spline(self.z_um, strength.astype(float))(self.z_um).astype(np.float32)
-        smooth = strength[:, None, None] * self.templates
-        tilt = self.stack - levelled(self.stack)
-        if len(self) >= 5:
-            corners = tilt[:, [0, 0, -1], [0, -1, 0]]
-            corners = np.stack([make_smoothing_spline(self.z_um, c)(self.z_um) for c in corners.T.astype(float)])
-            ramp = np.linspace(0, 1, self.size)
-            origin, right, down = corners[:, :, None, None]
-            tilt = origin + (right - origin) * ramp + (down - origin) * ramp[:, None]
-        rim = np.ones(self.stack.shape[1:], dtype=bool)
-        rim[1:-1, 1:-1] = False
-        level = (smooth + tilt)[:, rim].mean(axis=1)
-        bright = np.sign((smooth[:, self.size // 2, self.size // 2] - smooth[:, rim].mean(axis=1)).sum()) or 1
-        above = bright * level - (bright * level).min()
-        small = above < max(noise_level(self.stack) / 4, np.median(above) / 50)
-        y, x = np.nonzero(rim) - np.array(self.size // 2)
-        terms = np.stack([np.ones(len(x)), x, y, x * y], axis=1)
-        fit = np.linalg.lstsq(terms, self.stack[small][:, rim].mean(axis=0), rcond=None)[0]
-        y, x = np.indices(rim.shape) - self.size // 2
-        background = fit[0] + fit[1] * x + fit[2] * y + fit[3] * x * y
-        return (smooth + tilt - background).astype(np.float32)
-
-    @cached_property
-    def _columns(self) -> NDArray[np.float64]:
-        """How each image changes with x, y, z, brightness and background: (N, n * n, 5)."""
-        images = self.images.astype(np.float64)
-        down, across = (np.gradient(images, axis=axis) for axis in (1, 2))
-        along_z = np.gradient(images, self.z_um, axis=0)
-        columns = np.stack([-across, -down, along_z, images, np.ones_like(images)], axis=-1)
-        return columns.reshape(len(self), -1, 5)
-
-    def expected_error(
-        self, noise: float | None = None, *, electrons_per_count: float | None = None, brightness: float = 1.0
-    ) -> pd.DataFrame:
-        """Least error with which a lone particle can be measured: the Cramér-Rao bound.
-
-        Brightness and level of the background are unknown too. The bound is for the frame's noise alone; what
-        the noise of the calibration adds is `own_error`.
-
-        Parameters
-        ----------
-        noise : float, optional
-            Standard deviation of a pixel of the frame without light; that of the stack if not given.
-        electrons_per_count : float, optional
-            Photo-electrons behind a count of light, which then has Poisson noise; none if not given.
-        brightness : float
-            Of the particle, 1 for the calibration's.
-
-        Returns
-        -------
-        DataFrame
-            A row for each image: `z_um`, and standard deviations `x_std_px`, `y_std_px`, `z_std_um`.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is no number above 0.
-        """
-        noise = positive("noise", max(noise_level(self.stack), 1e-9) if noise is None else noise)
-        brightness = positive("brightness", brightness)
-        variance = np.full(self.images.shape, noise**2)
-        if electrons_per_count is not None:
-            light = brightness * np.abs(self.images)
-            variance += light / positive("electrons_per_count", electrons_per_count)
-        columns = brightness * self._columns / np.sqrt(variance).reshape(len(self), -1, 1)
-        covariance = np.linalg.inv(columns.transpose(0, 2, 1) @ columns)
-        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        names = ("x_std_px", "y_std_px", "z_std_um")
-        return pd.DataFrame({"z_um": self.z_um} | {name: std[:, i] for i, name in enumerate(names)})
-
-    @cached_property
-    def own_error(self) -> NDArray[np.float64]:
-        """What the noise of the stack does to positions measured with it: RMS error (N, 3) of x, y (px) and z (µm).
-
-        The error is that of every particle at that depth, so it does not average out. It is found by making
-        the calibration again, from its own images with fresh noise like the stack's, which may grow with the light.
-        """
-        errors = self._made_again[..., :3]
-        return np.sqrt(uniform_filter1d(np.mean(np.square(errors), axis=0), 5, axis=0, mode="nearest"))
-
-    @cached_property
-    def own_bias_um(self) -> NDArray[np.float64]:
-        """Error of z (N,) that is common to calibrations made again: what is to be taken from a measured z.
-
-        Denoising leaves out what is faint and fine, and at the ends of the stack it leaves the most noise, from which
-        measured depths keep away.
-        """
-        return uniform_filter1d(self._made_again[..., 3].mean(axis=0), 5, mode="nearest")
-
-    @cached_property
-    def _made_again(self) -> NDArray[np.float64]:
-        """Errors of calibrations from this one's images with fresh noise: (REPEATS, N, 4).
-
-        Of x, y and z as this calibration's columns tell, and of z as the other's own do.
-        """
-        truth = self.images.astype(np.float64)
-        light, rest = np.abs(truth), self.stack - denoised(self.stack)
-        per_count = max(np.polyfit(light.ravel(), rest.ravel() ** 2, 1)[0], 0)
-        noise = np.sqrt(noise_level(self.stack) ** 2 + per_count * light)
-        rows, errors = np.linalg.pinv(self._columns)[:, :3], []
-        for seed in range(REPEATS):
-            again = truth + np.random.default_rng(seed).normal(0, noise, truth.shape)
-            made = Calibration.from_stack(again, self.z_um, n_sub=len(self.subset))
-            off = (made.images - truth).reshape(len(self), -1, 1)
-            errors.append(np.concatenate([rows @ off, -np.linalg.pinv(made._columns)[:, 2:3] @ off], axis=1)[..., 0])
-        return np.array(errors)
+        return PatternModel.from_calibration(self)
 
     @cached_property
     def expected(self) -> NDArray[np.float32]:
@@ -418,22 +322,57 @@ class Calibration:
         ValueError
             If it is damaged, of another version, or no calibration.
         """
+        name = Path(path).name
         try:
-            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-                data = {name: file[name] for name in file.files}
+            with zipfile.ZipFile(path) as archive:
+                shapes = {part.removesuffix(".npy"): _shape(archive, part) for part in archive.namelist()}
+                _must_fit(shapes, {part.filename: part.file_size for part in archive.infolist()})
+            with np.load(path, allow_pickle=False) as file:
+                version = file["gdptlab_calibration"]
+                if not np.array_equal(version, VERSION):
+                    raise ValueError(f"it is of version {version}, allowed is version {VERSION}")
+                data = {part: file[part] for part in PARTS}
+            _must_be_sound(data)
         except FileNotFoundError:
             raise
         except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ValueError(
-                f"path: got {Path(path).name!r}, which cannot be read as a calibration: {error}"
-            ) from error
-        version = data.pop("gdptlab_calibration", None)
-        name = Path(path).name
-        if not np.array_equal(version, VERSION) or set(data) != {"stack", "z_um", "subset", "templates"}:
-            raise ValueError(f"path: got {name!r} of version {version}, allowed are calibrations of version {VERSION}")
-        if not len(data["stack"]) == len(data["z_um"]) == len(data["templates"]) > data["subset"].max():
-            raise ValueError(f"path: got {name!r}, whose parts do not fit each other")
+            raise ValueError(f"path: got {name!r}, which cannot be read as a calibration: {error}") from error
         return cls(**data)
+
+
+def _shape(archive: zipfile.ZipFile, part: str) -> tuple[int, ...]:
+    """Shape of an array in a file of numpy's, from its header alone."""
+    with archive.open(part) as opened:
+        major = np.lib.format.read_magic(opened)[0]
+        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        return read(opened)[0]
+
+
+def _must_fit(shapes: dict[str, tuple[int, ...]], sizes: dict[str, int]) -> None:
+    """Raise ValueError unless the arrays of a file, by their shapes, are those of a calibration and fit each other."""
+    if set(shapes) != {"gdptlab_calibration", *PARTS}:
+        raise ValueError(f"it holds {', '.join(shapes)}, needed are gdptlab_calibration, {', '.join(PARTS)}")
+    stack, images = shapes["stack"], len(shapes["z_um"]) and shapes["z_um"][0]
+    square = len(stack) == 3 and stack[0] == images >= 3 and stack[1] == stack[2] and stack[1] % 2 == 1
+    subset = len(shapes["subset"]) == 1 and 2 <= shapes["subset"][0] <= images
+    if not (square and subset and len(shapes["z_um"]) == 1 and shapes["templates"] == stack):
+        raise ValueError(f"its arrays have shapes that do not fit each other: {shapes}")
+    if max(sizes.values()) > 16 * np.prod(stack) + 1000:
+        raise ValueError(f"its arrays have more bytes than shapes: {sizes}")
+
+
+def _must_be_sound(data: dict[str, NDArray]) -> None:
+    """Raise ValueError unless arrays that fit each other are what `from_stack` would make of them."""
+    for part in PARTS:
+        if data[part].dtype.kind != ("i" if part == "subset" else "f") or not np.isfinite(data[part]).all():
+            raise ValueError(f"{part} holds what is not finite or not of its type, {data[part].dtype}")
+    if not (np.diff(data["z_um"]) > 0).all():
+        raise ValueError("z_um does not increase")
+    subset = data["subset"]
+    if subset.min() < 0 or subset.max() >= len(data["stack"]) or not (np.diff(subset) > 0).all():
+        raise ValueError(f"subset does not name images in increasing order: {subset}")
+    if np.abs(np.linalg.norm(data["templates"], axis=(1, 2)) - 1).max() > 1e-3:
+        raise ValueError("templates do not have norm 1")
 
 
 def _correlator(calibration: Calibration, shape: tuple[int, int]) -> Correlator:

@@ -1,8 +1,12 @@
-"""Normalised cross-correlation of one image with many small templates (Lewis 1995; the paper's Figure 2d).
+"""Normalised cross-correlation of a frame with many templates, and the peaks of the maps (the paper's Figure 2b to d).
 
-`Correlator` is the fast kernel, `correlate_plainly` the formula written out, which it is tested against. Both
-return the value for every position at which the whole template lies inside the image: entry [r, c] belongs to
-the window whose first pixel is (r, c), so its centre is (r + n // 2, c + n // 2) for templates n pixels wide.
+With a window W of the frame and a template T, both n by n pixels and less their means,
+
+    C = sum(W T) / sqrt(sum(W^2) sum(T^2))
+
+(J. P. Lewis, Vision Interface (1995) 120). `Correlator` computes C for every window that lies in the frame: entry
+[r, c] of a map belongs to the window whose first pixel is (r, c), so that its centre is (r + n // 2, c + n // 2).
+`peaks` then finds the maxima of the maps, between pixels too, and the profile of C_m over the maps at each.
 """
 
 from collections.abc import Iterable
@@ -14,13 +18,17 @@ from numpy.typing import NDArray
 from gdptlab._compiled import compiled, inlined
 
 FLAT = 1e-4
-"""A window whose contrast is below this fraction of the image's is taken as flat: its correlation is 0."""
+"""Standard deviation of a window, as a fraction of the frame's, below which the window counts as flat and C is 0.
+Chosen: rounding in the float32 transform changes C by about 1e-8 over this fraction, which is 1e-4 at the limit."""
 
 BETWEEN = 0.95
-"""Fraction of its C_m that a peak between pixels still has at the nearest one, about, at least."""
+"""Fraction of the threshold that a pixel must reach for a peak between pixels to be looked for there. Derived: half a
+pixel off in x and y, the templates of the sample stacks keep a correlation of 0.96 or more with themselves at the
+resolution of the search. A lower fraction costs time only; a higher one loses peaks at the threshold."""
 
 APART_PX = 2
-"""No pixel so near to a peak is higher."""
+"""Half-width, px, of the square in which a peak must be the highest pixel. Chosen: the maps are smooth over about two
+pixels; with 1 the ripples of noise on one peak count as several, with 3 and more neighbouring particles are lost."""
 
 
 def normalised(images: NDArray) -> NDArray[np.float32]:
@@ -40,15 +48,15 @@ def normalised(images: NDArray) -> NDArray[np.float32]:
 
 
 def good_shape(shape: Iterable[int]) -> tuple[int, ...]:
-    """Least numbers of rows and columns, none below those of `shape`, that are even and fast to transform."""
+    """Smallest even numbers of rows and columns that are quick to transform and not below those of `shape`."""
     return tuple(2 * cv2.getOptimalDFTSize((n + 1) // 2) for n in shape)
 
 
 class Correlator:
     """Plan for correlating frames of one shape with a set of templates.
 
-    One Fourier transform of the frame serves all templates, whose own are kept, and so do its local sums. The
-    memory it works in is kept too, so a plan serves one thread at a time.
+    One Fourier transform of the frame, and one set of local sums, serve all templates. The transforms of the templates
+    are kept, and so is the working memory, so that a plan serves one thread at a time.
 
     Parameters
     ----------
@@ -126,6 +134,7 @@ def _fill_per_norm(image, n, flat, per_norm):  # pragma: no cover
 
 @compiled
 def _multiply(image, per_norm, product):  # pragma: no cover
+    """Fill `product` (rows, columns) with the upper left part of `image` times `per_norm` (rows, columns)."""
     for r in range(per_norm.shape[0]):
         for c in range(per_norm.shape[1]):
             product[r, c] = image[r, c] * per_norm[r, c]
@@ -140,7 +149,7 @@ def times_conjugate(image, template, product):  # pragma: no cover
         for j in range((columns - 2) // 2):
             re, im = a[2 * j], a[2 * j + 1]
             c[2 * j], c[2 * j + 1] = re * b[2 * j] + im * b[2 * j + 1], im * b[2 * j] - re * b[2 * j + 1]
-    for q in (0, columns - 1):  # of their frequencies, each other's conjugates are packed in pairs of rows
+    for q in (0, columns - 1):  # in these two columns, real and imaginary parts stand in successive rows
         product[0, q] = image[0, q] * template[0, q]
         for r in range(1, rows - 1, 2):
             re, im = image[r, q], image[r + 1, q]
@@ -158,19 +167,19 @@ def peaks(
     ----------
     maps : float32 array (k, rows, columns)
     threshold : float
-        A peak reaches `BETWEEN` times this.
+        The highest pixel of a peak reaches `BETWEEN` times this.
     near : int
-        How far, in px, each map's own peak may be from it. Nearer to a rim there is no peak: it might be the flank
-        of one outside, whose place is unknown.
+        Largest distance, px, of each map's own peak from the peak of the highest. Peaks nearer than this to the rim are
+        left out: they might be the flank of a peak outside of the map.
 
     Returns
     -------
-    place : float64 array (n, 2)
-        Row and column of the top of the map that is highest.
+    position : float64 array (n, 2)
+        Row and column of the peak, between pixels, of the map that is highest there.
     cm : float32 array (n,)
-        Height of that top.
+        Height of that peak.
     profile : float32 array (n, k)
-        Height of each map at its own top, between pixels.
+        Height of each map's own peak near it, between pixels.
     """
     highest = maps.max(axis=0)
     at = _peaks(highest, np.float32(BETWEEN * threshold), max(near, 1))
@@ -179,19 +188,35 @@ def peaks(
     return tops[np.arange(len(at)), profile.argmax(axis=1)], profile.max(axis=1), profile
 
 
-def strongest(place: NDArray[np.float64], cm: NDArray, distance_px: float) -> NDArray[np.int64]:
-    """Indices by falling C_m (n,), without those nearer than this to a stronger one, or with none; of places (n, 2)."""
+def strongest(position: NDArray[np.float64], cm: NDArray, distance_px: float) -> NDArray[np.int64]:
+    """Choose the strongest of the candidates that are near to each other.
+
+    Parameters
+    ----------
+    position : float64 array (n, 2)
+        Row and column.
+    cm : array (n,)
+        Candidates with 0 are left out.
+    distance_px : float
+        A candidate is left out if a stronger one that stays lies nearer than this.
+
+    Returns
+    -------
+    int64 array (m,)
+        Indices of those that stay, highest C_m first.
+    """
     order = np.argsort(-cm, kind="stable")
-    return _apart(place, order[cm[order] > 0], min(distance_px, 1e150) ** 2)  # of more, the square is no number
+    return _apart(position, order[cm[order] > 0], min(distance_px, 1e150) ** 2)  # a larger square overflows
 
 
 @compiled
-def _apart(place, order, square):  # pragma: no cover
+def _apart(position, order, square):  # pragma: no cover
+    """Indices from `order` (n,) without those whose squared distance to an earlier one that stays is below `square`."""
     kept, n = np.empty(len(order), np.int64), 0
     for i in order:
         alone = True
         for k in kept[:n]:
-            y, x = place[i, 0] - place[k, 0], place[i, 1] - place[k, 1]
+            y, x = position[i, 0] - position[k, 0], position[i, 1] - position[k, 1]
             if y * y + x * x <= square:
                 alone = False
                 break
@@ -203,7 +228,7 @@ def _apart(place, order, square):  # pragma: no cover
 
 @compiled
 def _peaks(highest, threshold, rim):  # pragma: no cover
-    """Rows and columns (n, 2) of the local maxima."""
+    """Rows and columns (n, 2) of the local maxima of a map at or above `threshold`, `rim` pixels or more inside."""
     rows, columns = highest.shape
     found = []
     for r in range(rim, rows - rim):
@@ -227,7 +252,7 @@ def _peaks(highest, threshold, rim):  # pragma: no cover
 
 @inlined
 def _parabola(before, here, after):  # pragma: no cover
-    """Where the parabola through three values, at -1, 0 and 1, has its top, and how far that is above the middle."""
+    """Vertex of the parabola through three values at -1, 0 and 1, and its height above the middle value."""
     bend = before + after - 2 * here
     slope = (after - before) / 2
     if bend >= 0:
@@ -239,6 +264,7 @@ def _parabola(before, here, after):  # pragma: no cover
 
 @compiled
 def _read(maps, at, near, profile, tops):  # pragma: no cover
+    """Fill `profile` (n, k) and `tops` (n, k, 2) with height and position of each map's peak near `at` (n, 2)."""
     last_row, last_column = maps.shape[1] - 1, maps.shape[2] - 1
     for i in range(len(at)):
         for k in range(len(maps)):
@@ -256,7 +282,7 @@ def _read(maps, at, near, profile, tops):  # pragma: no cover
 
 
 def vertex(values: NDArray) -> NDArray:
-    """Top, within (-1/2, 1/2), of the parabola through three values (n, 3) at -1, 0 and 1."""
+    """Vertex, within -1/2 and 1/2, of the parabolas through three values (n, 3) at -1, 0 and 1; (n,)."""
     before, here, after = values.T
     bend = before + after - 2 * here
     slope = (after - before) / 2
@@ -264,7 +290,7 @@ def vertex(values: NDArray) -> NDArray:
 
 
 def standardised(profiles: NDArray) -> NDArray:
-    """Rows with mean 0 and norm 1."""
+    """Rows of (n, k), each less its mean and over its norm: their products are Pearson correlations."""
     centred = profiles - profiles.mean(axis=1, keepdims=True)
     norm = np.linalg.norm(centred, axis=1, keepdims=True)
     return centred / np.where(norm > 0, norm, 1)

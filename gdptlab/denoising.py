@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.fft import dctn, idctn
-from scipy.ndimage import gaussian_filter1d
+from scipy.fft import dct, dctn, idctn
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.optimize import nnls
 
 from gdptlab._compiled import on_one_core
 
@@ -18,17 +19,28 @@ SMOOTHED = (1.5, 1.5, 0.7)
 """Frequencies in the block, and orders along z, over which the power of its spectrum is smoothed."""
 
 DOUBT = 2.0
-"""Times the power of the noise that is taken from that power. As it still scatters, of noise alone next to nothing is
-left."""
+"""Over-subtraction factor of the Wiener filter. The smoothed power still scatters, so that a factor of 1 would leave a
+part of the noise where there is nothing else."""
+
+FIRST_BLUR = 1.5
+"""Standard deviation, in slices and px, of the Gaussian filter that gives the first guess of the light behind each
+pixel's photon noise. The guess only sorts pixels by their light, so that its width hardly matters."""
+
+LEAST_IN_BIN = 100
+"""Fewest pixels from whose scatter a variance is taken; it is then known to 15 %."""
+
+MEDIAN_SIZE = 2 * 0.6745
+"""Median size of the mixed second differences of Gaussian noise of standard deviation 1."""
 
 
 @on_one_core
 def denoised(stack: NDArray) -> NDArray[np.float32]:
     """Smooth model of a stack: a Wiener filter along z and in the image, in small blocks.
 
-    From block to block it follows how bright and how sharp the images are. What is symmetric and what is antisymmetric
-    about the middle row and column is filtered each for itself: a particle that is its own mirror image
-    has nothing in three of the four parts, and three quarters of the noise go with them.
+    From block to block the filter follows how bright and how sharp the images are, and how noisy: the noise of a pixel
+    may grow with its value, as that of photons does, and the stack itself tells how (`noise_line`). What is symmetric
+    and what is antisymmetric about the middle row and column is filtered each for itself: a particle that is its own
+    mirror image has nothing in three of the four parts, and three quarters of the noise go with them.
 
     Parameters
     ----------
@@ -39,10 +51,21 @@ def denoised(stack: NDArray) -> NDArray[np.float32]:
     -------
     float32 array (N, n, n)
     """
+    stack = np.asarray(stack, dtype=np.float32)
+    guess = gaussian_filter(stack, FIRST_BLUR, mode="nearest")
+    # The first line takes fine structure for noise, the second one only what the first filter took for noise.
+    smooth = _smoothed(stack, np.polyval(noise_line(stack, guess), guess))
+    return _smoothed(stack, np.polyval(noise_line(stack - smooth, smooth), smooth))
+
+
+def _smoothed(stack: NDArray[np.float32], variance: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Stack (N, n, n) with noise of that variance (N, n, n), filtered in its symmetric and antisymmetric parts."""
     half = stack.shape[1] // 2
     over = min(BLOCK // 2, half)  # blocks reach beyond the middle
     levels = stack.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
-    rest, variance = (stack - levels).astype(np.float32), noise_level(stack) ** 2 / 4
+    rest = (stack - levels).astype(np.float32)
+    variance = (variance + variance[:, ::-1]).astype(np.float32)
+    variance = (variance + variance[:, :, ::-1])[:, half - over :, half - over :] / 16
     smooth, away = np.zeros_like(rest), np.arange(-half, half + 1)
     sides = {1: np.ones(len(away), np.float32), -1: np.sign(away).astype(np.float32)}
     for down, y_side in sides.items():
@@ -55,8 +78,8 @@ def denoised(stack: NDArray) -> NDArray[np.float32]:
     return (smooth + levels).astype(np.float32)
 
 
-def _filtered(stack: NDArray[np.float32], variance: float) -> NDArray[np.float32]:
-    """Images (N, m, m) with noise of that variance, filtered in blocks along z, y and x."""
+def _filtered(stack: NDArray[np.float32], variance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Images (N, m, m) with noise of that variance (N, m, m), filtered in blocks along z, y and x."""
     count, edge = min(WINDOW, len(stack)), min(BLOCK, stack.shape[1])
     # Polynomials, not cosines, as images still change at the ends of a window.
     along_z = np.linalg.qr(np.vander(np.linspace(-1, 1, count), increasing=True))[0].astype(np.float32)
@@ -66,6 +89,7 @@ def _filtered(stack: NDArray[np.float32], variance: float) -> NDArray[np.float32
         gaussian_filter1d(np.eye(n, dtype=np.float32), sigma, axis=0, mode="nearest")
         for n, sigma in zip(sizes, SMOOTHED, strict=True)
     ]
+    squares = dct(np.eye(edge, dtype=np.float32), axis=0, norm="ortho") ** 2
     taper = np.sin((np.arange(edge) + 0.5) * np.pi / edge).astype(np.float32)
     taper = taper[:, None] * taper
     starts = np.rint(np.linspace(0, stack.shape[1] - edge, -(-2 * (stack.shape[1] - edge) // edge) + 1)).astype(int)
@@ -76,7 +100,8 @@ def _filtered(stack: NDArray[np.float32], variance: float) -> NDArray[np.float32
             spectra = sliding_window_view(dctn(stack[block], axes=(1, 2), norm="ortho"), count, axis=0) @ along_z
             power = blurs[0] @ (spectra**2 @ blurs[2].T).reshape(len(spectra), edge, -1)
             power = blurs[1] @ power.reshape(spectra.shape)
-            spectra *= 1 - np.minimum(DOUBT * variance / np.where(power > 0, power, 1), 1)
+            noise = sliding_window_view(squares @ variance[block] @ squares.T, count, axis=0) @ along_z**2
+            spectra *= 1 - np.minimum(DOUBT * noise / np.where(power > 0, power, 1), 1)
             filtered, together = np.zeros_like(stack[block]), np.zeros((len(stack), 1, 1), np.float32)
             for k, each in enumerate(trust):
                 filtered[k : len(stack) - count + 1 + k] += each * (spectra @ along_z[k])
@@ -98,8 +123,42 @@ def noise_level(images: NDArray) -> float:
     float
         From the median size of mixed second differences, which few sharp edges do not move.
     """
-    mixed = np.diff(np.diff(np.asarray(images, dtype=np.float64), axis=-1), axis=-2)
-    return float(np.median(np.abs(mixed)) / (2 * 0.6745))
+    return float(np.median(np.abs(_mixed_differences(images))) / MEDIAN_SIZE)
+
+
+def noise_line(noise: NDArray, smooth: NDArray) -> NDArray[np.float64]:
+    """Variance of the noise of a pixel as a line in the pixel's value: photon noise over read noise.
+
+    Parameters
+    ----------
+    noise : array (..., rows, columns)
+        Images, or what a smooth model leaves of them.
+    smooth : array (..., rows, columns)
+        About their values without noise.
+
+    Returns
+    -------
+    float64 array (2,)
+        Slope, 0 or above, and intercept, for `numpy.polyval`; at every value in `smooth` the variance is above 0, but
+        of images without noise.
+    """
+    size = np.abs(_mixed_differences(noise)).ravel()
+    value = (smooth[..., 1:, 1:] + smooth[..., 1:, :-1] + smooth[..., :-1, 1:] + smooth[..., :-1, :-1]).ravel() / 4
+    bins = np.array_split(np.argsort(value), max(min(len(value) // LEAST_IN_BIN, 200), 1))
+    variance = np.array([(np.median(size[part]) / MEDIAN_SIZE) ** 2 for part in bins])
+    darkest, span = float(smooth.min()), float(np.ptp(smooth))
+    least = (np.median(size) / MEDIAN_SIZE) ** 2 / 4
+    if len(bins) < 4 or span == 0 or least == 0:
+        return np.array([0, 4 * least])
+    light = np.array([value[part].mean() - darkest for part in bins]) / span
+    terms = np.stack([np.ones(len(bins)), light], axis=1) / np.maximum(variance, least)[:, None]
+    level, slope = nnls(terms, variance / np.maximum(variance, least))[0]
+    return np.array([slope / span, max(level, least) - slope / span * darkest])
+
+
+def _mixed_differences(images: NDArray) -> NDArray[np.float64]:
+    """Mixed second differences (..., rows - 1, columns - 1), each of four pixels that meet in a corner."""
+    return np.diff(np.diff(np.asarray(images, dtype=np.float64), axis=-1), axis=-2)
 
 
 def signal_to_noise(stack: NDArray) -> NDArray[np.float64]:

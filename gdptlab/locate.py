@@ -1,23 +1,25 @@
-"""From a frame to a table of particles, without segmentation.
+"""From a frame, or a film, to a table of particles, without segmentation.
 
 By correlation (the paper's section 2):
 
 1. The frame is correlated with the N_sub images of the calibration's subset (Figure 2b).
-2. Candidates are local peaks, in any of the maps, above a threshold.
-3. A candidate's profile is the highest C_m in each map within two pixels of the peak (Figure 2c), at the top of
-   parabolas through the neighbouring pixels: peaks lie between pixels, and those of different maps a pixel apart.
-4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, which is blind
-   to the noise that lowers the whole profile; a parabola through the best three gives the part of a step.
-5. Refinement: the candidate's window is correlated with stack images from the guess onward, uphill along z
-   until C_m no longer rises. Between pixels and images, x, y and z are the least-squares displacement of the
-   best image within that window.
+2. Candidates are the local maxima above a threshold in any of the maps.
+3. The profile of a candidate is the highest C_m of each map within two pixels of the maximum (Figure 2c), taken at the
+   vertex of parabolas through the neighbouring pixels: peaks lie between pixels, those of different maps a pixel apart.
+4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, since noise lowers
+   the whole profile and Pearson's correlation does not depend on its level. A parabola through the best three gives z
+   between slices.
+5. Refinement: the window of the candidate is correlated with templates from the guess onward, uphill along z until C_m
+   no longer rises. Between pixels and slices, x, y and z follow from least squares in that window (`refinement`).
 6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
 
-A particle is then measured only if its whole window lies in the frame; nothing is said of a border half a
-template wide. Or jointly (`overlap`): particles may overlap and be cut by the frame's edge.
+A particle is measured only if its whole window lies in the frame, so that a border half a template wide stays empty.
+With ``method="joint"`` all particles of a frame are fitted at once (`gdptlab.fit`): they may overlap and be cut by the
+frame's edge.
 """
 
 from collections.abc import Container, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import count, islice
 
 import cv2
@@ -27,22 +29,23 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from gdptlab._checks import choice, flag, positive, real_array, whole
+from gdptlab._checks import choice, flag, image_array, positive, whole
 from gdptlab._compiled import on_one_core
 from gdptlab.calibration import Calibration, checked
 from gdptlab.correlation import peaks, standardised, strongest, vertex
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
-"""Columns of the table that `locate` returns, and their types."""
+"""Columns of the table that `locate` returns by correlation, and their types."""
 
 THRESHOLD = 0.5
 """Lowest C_m of a particle, if none is given (the paper, section 2: normally 0.5)."""
 
 METHODS = ("correlation", "joint")
-"""How `locate` can work."""
+"""Methods of `locate`."""
 
 BLOCK = 25
-"""Consecutive frames that `batch` hands to a process: long against what it costs to hand them over."""
+"""Number of consecutive frames that `batch` hands to a process at a time. Chosen: measuring them takes some hundred
+times as long as handing them over."""
 
 
 @on_one_core
@@ -60,18 +63,18 @@ def locate(
     Parameters
     ----------
     image : array (rows, columns)
-        Any real type, no smaller than a template.
+        Any real type; no smaller than a template.
     calibration : Calibration
     method : str
-        "correlation", or "joint": all particles fitted at once, for those that overlap. That is slower, and
-        it takes the particles to be about equally bright. It finds its own threshold, from the noise.
+        "correlation", or "joint": all particles are fitted at once, for particles that overlap. The joint fit is
+        slower, and its threshold follows from the noise.
     threshold : float, optional
         Lowest C_m of a particle, above 0, at most 1; `THRESHOLD` if not given. Like the next two, it belongs to
         "correlation" and is refused with "joint".
     refine : bool
-        Walk along the whole stack to the best C_m. Without it, z comes from the subset's profile alone.
+        Walk along the whole stack to the best C_m. Without refinement, z comes from the subset's profile alone.
     min_distance_px : float, optional
-        Nearest that two particles can be told apart; a quarter of a template if not given.
+        Smallest distance of two particles; a quarter of a template if not given.
 
     Returns
     -------
@@ -79,11 +82,10 @@ def locate(
         A row for each particle, highest C_m first. `x_px` to the right and `y_px` down, the first pixel's
         centre at (0, 0); `z_um` in the depths of the calibration; `cm`, the correlation with the best image;
         `at_end`, whether that is the stack's first or last image, so that z may lie beyond it. With
-        "joint" `z_um` is less `Calibration.own_bias_um`, and there are also `x_std_px`, `y_std_px` and `z_std_um`,
-        standard deviations (noise of the frame and of the calibration, neighbours considered; wider for a
-        particle unlike the others in amplitude); `amplitude`, 1 for that of the calibration's particle; and
-        `chi2`, the mean square of what is left around the particle, in units of the noise: well above 1 for
-        what is no particle of this kind.
+        "joint" `z_um` is less the calibration's own bias (`fit.own_bias_um`), and there are also `x_std_px`,
+        `y_std_px` and `z_std_um`, standard deviations; `amplitude`, 1 for the calibration's particle; `chi2`, the mean
+        square of the residual around the particle over its variance, well above 1 for what is no particle of this kind;
+        and the columns that `fit.Joint.table` names.
 
     Raises
     ------
@@ -103,27 +105,27 @@ def locate(
     if choice("method", method, METHODS) == "joint":
         if threshold is not None or not flag("refine", refine) or min_distance_px is not None:
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
-        from gdptlab.fit.joint import explained
+        from gdptlab.fit.frames import explained
 
         return explained(image, calibration)[0]
     threshold = THRESHOLD if threshold is None else threshold
     image, distance = checked_frame(image, calibration, threshold, min_distance_px)
-    place, step, cm = _candidates(image, calibration, threshold)
+    position, slice_, cm = _candidates(image, calibration, threshold)
     if flag("refine", refine):
-        place, step, cm = _refined(image, calibration, place, step)
-    kept = strongest(place, np.where(cm >= threshold, cm, 0), distance)
-    place, step, cm = place[kept], step[kept], cm[kept]
+        position, slice_, cm = _refined(image, calibration, position, slice_)
+    kept = strongest(position, np.where(cm >= threshold, cm, 0), distance)
+    position, slice_, cm = position[kept], slice_[kept], cm[kept]
     if not refine:
-        first = _pixels(image, calibration, place)
-        shift = calibration.displacement(image, first, np.rint(step))
-        place = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
-    return as_table(place, step, cm, calibration.z_um)
+        first = _pixels(image, calibration, position)
+        shift = calibration.displacement(image, first, np.rint(slice_))
+        position = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
+    return as_table(position, slice_, cm, calibration.z_um)
 
 
 def checked_frame(
     image: ArrayLike, calibration: Calibration, threshold: float, min_distance_px: float | None
 ) -> tuple[NDArray[np.float32], float]:
-    """Image, less its mean, and distance in px, if all four are what `locate` takes."""
+    """Check the arguments of `locate`; the image (rows, columns) less its mean, and the distance in px."""
     image = checked_image(image, calibration)
     if not 0 < positive("threshold", threshold) <= 1:
         raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
@@ -134,24 +136,24 @@ def checked_frame(
 
 
 def checked_image(image: ArrayLike, calibration: Calibration) -> NDArray[np.float32]:
-    """Image, if it is one that holds at least a template."""
+    """Check that an image (rows, columns) holds at least a template; the image as float32."""
     size = checked(calibration).size
-    image = real_array("image", image, 2)
+    image = image_array("image", image, 2)
     if min(image.shape) < size:
         raise ValueError(f"image: got shape {image.shape}, allowed is no smaller than a template, {(size, size)}")
     return image
 
 
-def as_table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.DataFrame:
-    """What `locate` returns, of places (y, x) (n, 2), z in steps of the stack, C_m, and the depths of the steps."""
+def as_table(position: NDArray, slice_: NDArray, cm: NDArray, z_um: NDArray) -> pd.DataFrame:
+    """Table of `locate`, from positions (y, x) (n, 2), z in slices (n,), C_m (n,) and the depths of the slices (N,)."""
     last = len(z_um) - 1
     return pd.DataFrame(
         {
-            "x_px": place[:, 1].astype(float),
-            "y_px": place[:, 0].astype(float),
-            "z_um": np.interp(step, np.arange(last + 1), z_um),
+            "x_px": position[:, 1].astype(float),
+            "y_px": position[:, 0].astype(float),
+            "z_um": np.interp(slice_, np.arange(last + 1), z_um),
             "cm": np.minimum(cm, 1).astype(float),
-            "at_end": (step <= 0) | (step >= last),
+            "at_end": (slice_ <= 0) | (slice_ >= last),
         }
     )
 
@@ -159,30 +161,30 @@ def as_table(place: NDArray, step: NDArray, cm: NDArray, z_um: NDArray) -> pd.Da
 def _candidates(
     image: NDArray[np.float32], calibration: Calibration, threshold: float
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Peaks of the correlation maps: place (y, x) (n, 2), z in steps of the stack, C_m."""
+    """Peaks of the correlation maps: positions (y, x) (n, 2), z in slices (n,), C_m (n,)."""
     scale, near = (2, 1) if calibration.half_resolution else (1, 2)
     searched = cv2.pyrDown(image) if scale == 2 else image
     maps = calibration.correlator(searched.shape)(searched)
-    place, cm, profile = peaks(maps, threshold, near)
-    likeness = standardised(profile) @ standardised(calibration.expected).T
-    k = np.clip(likeness.argmax(axis=1), 1, len(calibration) - 2)
-    step = k + vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
+    position, cm, profile = peaks(maps, threshold, near)
+    agreement = standardised(profile) @ standardised(calibration.expected).T
+    k = np.clip(agreement.argmax(axis=1), 1, len(calibration) - 2)
+    slice_ = k + vertex(agreement[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
     middle = calibration.search_templates.shape[-1] // 2
-    return scale * (place + middle), step, cm
+    return scale * (position + middle), slice_, cm
 
 
-def _pixels(image: NDArray[np.float32], calibration: Calibration, place: NDArray) -> NDArray[np.int64]:
-    """First pixels (n, 2) of the windows around `place` (n, 2), the nearest that lie in the image."""
-    first = np.rint(place - calibration.size // 2).astype(int)
+def _pixels(image: NDArray[np.float32], calibration: Calibration, position: NDArray) -> NDArray[np.int64]:
+    """First pixels (n, 2) of the windows nearest to `position` (n, 2) that lie in the image."""
+    first = np.rint(position - calibration.size // 2).astype(int)
     return np.clip(first, 0, np.array(image.shape) - calibration.size)
 
 
 def _refined(
-    image: NDArray[np.float32], calibration: Calibration, place: NDArray, step: NDArray
+    image: NDArray[np.float32], calibration: Calibration, position: NDArray, slice_: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Walk every candidate along the stack and across the pixels to its best C_m (0 if it leaves the frame)."""
+    """Walk every candidate along the stack and across the pixels to its best C_m (0 if the walk leaves the frame)."""
     last = len(calibration) - 1
-    start = _pixels(image, calibration, place), np.clip(np.rint(step), 0, last)
+    start = _pixels(image, calibration, position), np.clip(np.rint(slice_), 0, last)
     first, k, cm, shift = calibration.displacement.walk(image, *start)
     part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[k], -0.5, 0.5)
     inner = (k > 0) & (k < last)
@@ -272,28 +274,32 @@ def in_blocks(
     before a missing block is measured once more; otherwise blocks know nothing of each other.
     """
     if settings.get("method") == "joint":
-        from gdptlab.fit.joint import explained
+        from gdptlab.fit.frames import explained
 
         before = None
         for first, block in _blocks(frames, ()):
             tables = []
-            for frame in block:
-                table, before = explained(frame, calibration, before)
+            for k, frame in enumerate(block, first):
+                with _numbered_error(k):
+                    table, before = explained(frame, calibration, before)
                 tables.append(table)
             if first not in done:
                 yield first, len(tables), _numbered(tables, first)
         return
     jobs = (delayed(_located)(block, first, calibration, settings) for first, block in _blocks(frames, done))
     # What joblib puts into shared memory stays there until the last frame: of a long film too much.
-    yield from Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch="n_jobs + 1", max_nbytes=None)(jobs)
+    for first, n, table in Parallel(n_jobs, return_as="generator", pre_dispatch="n_jobs + 1", max_nbytes=None)(jobs):
+        if isinstance(table, Exception):
+            raise table
+        yield first, n, table
 
 
 def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:
     """Number of the first frame, and frames, of each block not in `done`, to be handed to a process."""
-    if hasattr(frames, "shape"):  # arrays of numpy, dask and zarr, and `Images`: nothing is read yet
+    if len(getattr(frames, "shape", ())) == 3:  # arrays of numpy, dask and zarr, and `Images`: nothing is read yet
         blocks = (frames[first : first + BLOCK] for first in range(0, len(frames), BLOCK))
     else:
-        copies = map(np.array, frames)  # a camera may show every frame in the same piece of memory
+        copies = _copies(frames)
         blocks = iter(lambda: list(islice(copies, BLOCK)), [])
     for first, block in zip(count(0, BLOCK), blocks, strict=False):
         if first not in done:
@@ -303,12 +309,42 @@ def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple
             yield first, list(block.copy()) if isinstance(block, np.ndarray) else block
 
 
+def _copies(frames: Iterable[ArrayLike]) -> Iterator[NDArray]:
+    """Copies of frames (rows, columns), for a camera may show every frame in the same piece of memory."""
+    shape = None
+    for k, frame in enumerate(frames):
+        copy = np.ma.array(frame) if np.ma.is_masked(frame) else np.array(frame)
+        shape = shape or copy.shape
+        if copy.shape != shape:
+            raise ValueError(f"frames: got shape {copy.shape} in frame {k}, allowed is that of frame 0, {shape}")
+        yield copy
+
+
 def _located(
     block: Iterable[ArrayLike], first: int, calibration: Calibration, settings: dict[str, object]
-) -> tuple[int, int, pd.DataFrame]:
-    """Number of the first frame of a block, how many there are, and what is in them."""
-    tables = [locate(frame, calibration, **settings) for frame in block]
+) -> tuple[int, int, pd.DataFrame | Exception]:
+    """Number of the first frame of a block, how many there are, and what is in them, or the error of one.
+
+    An error that is raised in another process would stop the blocks before it, too, and they would be lost.
+    """
+    tables = []
+    try:
+        for k, frame in enumerate(block, first):
+            with _numbered_error(k):
+                tables.append(locate(frame, calibration, **settings))
+    except Exception as error:
+        return first, len(tables), error
     return first, len(tables), _numbered(tables, first)
+
+
+@contextmanager
+def _numbered_error(frame: int) -> Iterator[None]:
+    """Add the number of the frame to an error about it."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        kind = ValueError if isinstance(error, ValueError) else TypeError
+        raise kind(f"{error} (frame {frame})") from error
 
 
 def _numbered(tables: list[pd.DataFrame], first: int) -> pd.DataFrame:

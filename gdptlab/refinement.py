@@ -1,9 +1,13 @@
-"""How far a particle is from the template that resembles it most: least squares within one window.
+"""Refinement: walk along the stack to the best template, then least squares between pixels and between slices.
 
-Around the pixel and the depth of a template T, a window shows a T(y - dy, x - dx; z + dz) on a background of some
-level and slope. Linear in dz, and up to third order in dy and dx, the unknowns follow from a few products that are
-prepared for each template, so that there is nothing to iterate but small numbers. Where another template resembles
-the particle more, or another pixel is nearer, `Displacement.walk` goes there first. The kernels are compiled (numba).
+Near the pixel and the depth of a template T a window shows
+
+    W = a T(y - dy, x - dx; z + dz) + background of some level and slope.
+
+The model is expanded about the template, to first order in dz and to third order in dy and dx. The products that least
+squares needs are prepared for each template, so that a solution costs four products of the window and a few small
+numbers. `Displacement.walk` first climbs to the template, and to the pixel, that fits best (the paper's walking
+procedure). The kernels are compiled (numba).
 """
 
 import numpy as np
@@ -12,20 +16,23 @@ from scipy.ndimage import correlate1d
 
 from gdptlab._compiled import compiled, inlined
 
-# Central differences of order 0 to 3, of Stirling's interpolation formula.
 DIFFERENCES = ([1.0], [-0.5, 0.0, 0.5], [1.0, -2.0, 1.0], [-0.5, 1.0, 0.0, -1.0, 0.5])
+"""Central differences of order 0 to 3 (Stirling's interpolation formula)."""
 
-# Orders along (y, x) of what is not linear.
 CURVED = [(i, j) for i in range(4) for j in range(4) if 2 <= i + j <= 3]
+"""Orders along (y, x) of the terms that are not linear."""
 
 ROUNDS = 2
-"""Of inserting the solution into the terms that are not linear."""
+"""Number of times the solution is inserted into the terms that are not linear. Derived: each round gains an order, and
+the expansion has three."""
 
-PLACES = 8
-"""Of a walk, at most. Most particles need one or two, a few of a crowded frame more."""
+MOST_WINDOWS = 8
+"""Largest number of windows that a walk looks at. Most particles need one or two, a few in crowded frames more; the
+limit ends walks to and fro between two neighbours."""
 
 AWAY_PX = 0.6
-"""Beyond this the next pixel is nearer: not half a pixel, or particles half-way would go to and fro."""
+"""Displacement, px, beyond which the walk goes to the next pixel. Derived: more than half a pixel, or particles
+half-way between two pixels would be sent to and fro."""
 
 
 class Displacement:
@@ -57,17 +64,17 @@ class Displacement:
         Parameters
         ----------
         image : float32 array (rows, columns)
-            With a mean near zero, so that products lose no digits.
+            Its mean is near zero, so that products lose no digits.
         first : int array (m, 2)
             First row and column of each window; all of it lies in the image.
         k : int array (m,)
-            Template that each is compared with.
+            Template that each window is compared with.
 
         Returns
         -------
         float64 array (m, 3)
-            dy, dx (px) and dz (µm); 0 where the window shows nothing like the template. Trustworthy to about
-            a pixel, and half-way to the next template.
+            dy, dx (px) and dz (µm); 0 where the window shows nothing like the template. They hold up to about a pixel,
+            and half-way to the next template.
         """
         shift = np.zeros((len(first), 3))
         _solve(image, first.astype(np.int64), k.astype(np.int64), self._rows, self._curved, ROUNDS, shift)
@@ -76,19 +83,19 @@ class Displacement:
     def walk(
         self, image: NDArray[np.float32], first: NDArray, k: NDArray
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Climb along the templates to the nearest best one, and across the pixels to the nearest, then solve.
+        """Climb along the templates to the nearest maximum of C_m, and across the pixels to the nearest, then solve.
 
         Parameters
         ----------
         image, first, k
-            As for a call; where to begin.
+            As for a call: where the walk begins.
 
         Returns
         -------
         first : int array (m, 2)
         k : int array (m,)
         cm : float64 array (m,)
-            Correlation of that window and that template; 0 where the walk leads out of the image.
+            Correlation of that window with that template; 0 where the walk leads out of the image.
         shift : float64 array (m, 3)
             As from a call.
         """
@@ -99,7 +106,7 @@ class Displacement:
 
 
 def _difference(images: NDArray, order_y: int, order_x: int) -> NDArray:
-    """Central differences of (N, n, n) along y and x."""
+    """Central differences of images (N, n, n), of these orders along y and x."""
     for axis, order in ((1, order_y), (2, order_x)):
         images = correlate1d(images, DIFFERENCES[order], axis=axis, mode="nearest")
     return images
@@ -107,6 +114,7 @@ def _difference(images: NDArray, order_y: int, order_x: int) -> NDArray:
 
 @inlined
 def _dot(a, b):  # pragma: no cover
+    """Product of two float32 vectors (n,)."""
     total = np.float32(0)
     for i in range(len(a)):
         total += a[i] * b[i]
@@ -115,7 +123,7 @@ def _dot(a, b):  # pragma: no cover
 
 @inlined
 def _look(image, top, left, seen):  # pragma: no cover
-    """Copy a window into `seen` (n * n,) and take its mean away. Its norm."""
+    """Copy a window, less its mean, into `seen` (n * n,), and return its norm."""
     n = int(np.sqrt(len(seen)))
     total = np.float32(0)
     for r in range(n):
@@ -131,7 +139,7 @@ def _look(image, top, left, seen):  # pragma: no cover
 
 @inlined
 def _displaced(seen, rows, curved, rounds, shift):  # pragma: no cover
-    """Write dy, dx, dz of a window against the template of these `rows` (4, n * n), `curved` (4, terms)."""
+    """Fill `shift` (3,) with dy, dx, dz of a window against a template of `rows` (4, n * n), `curved` (4, terms)."""
     products, solution = np.empty(4), np.empty(4)
     for i in range(4):
         products[i] = solution[i] = _dot(rows[i], seen)
@@ -157,6 +165,7 @@ def _displaced(seen, rows, curved, rounds, shift):  # pragma: no cover
 
 @compiled
 def _solve(image, first, k, rows, curved, rounds, shift):  # pragma: no cover
+    """Fill `shift` (m, 3) for the windows at `first` (m, 2), each against its template k."""
     seen = np.empty(rows.shape[2], np.float32)
     for i in range(len(first)):
         _look(image, first[i, 0], first[i, 1], seen)
@@ -165,12 +174,13 @@ def _solve(image, first, k, rows, curved, rounds, shift):  # pragma: no cover
 
 @compiled
 def _walk(image, first, k, templates, rows, curved, rounds, cm, shift):  # pragma: no cover
+    """Move `first` (m, 2) and `k` (m,) to where each walk ends, and fill `cm` (m,) and `shift` (m, 3)."""
     n, last = int(np.sqrt(templates.shape[1])), len(templates) - 1
     seen = np.empty(n * n, np.float32)
     scores, looked = np.empty(last + 1, np.float32), np.empty(last + 1, np.bool_)
     for i in range(len(first)):
         top, left = first[i]
-        for _ in range(PLACES):
+        for _ in range(MOST_WINDOWS):
             first[i, 0], first[i, 1] = top, left
             norm = _look(image, top, left, seen)
             looked[:] = False

@@ -29,7 +29,7 @@ def measured(number: int) -> dict[str, float]:
     film = Film.seeded(FIRST_SEED + number, focusing=FOCUSING, mean_in_view=IN_VIEW, duration_s=DURATION_S)
     stack = film.stack(size=SIZE_PX, seed=FIRST_STACK + number // SHARE_A_STACK)
     table = batch(film, Calibration.from_stack(*stack, n_sub=N_SUB), method="joint", progress=False)
-    tracks = link(film.to_channel(table), FOCUSING.channel, film.frame_rate_hz, **LINKS)
+    tracks = link(film.to_channel(table), predictor=FOCUSING.channel, frame_rate_hz=film.frame_rate_hz, **LINKS)
     scores, fit = link_scores(tracks, film.truth()), fit_energy(tracks, FOCUSING, film.frame_rate_hz)
     row = {"seed": film.seed, "links_right": scores["right"], "links_found": scores["found"]}
     return row | {f"{name}_{column}": fit.loc[name, column] for name in ENERGIES for column in ("value", "low", "high")}

@@ -1,11 +1,13 @@
 """Tables that guard a rebuild: what the package measured when they were stored (`test_stored_results.py` compares).
 
-``python tests/stored_results.py`` stores them anew: only for a change that is meant to alter a number, in a commit of
-its own that says why. Beside the tables, ``made_on.json`` names the versions and the processor that made them.
+``python tests/stored_results.py [NAME ...]`` stores all, or these, anew: only for a change that is meant to alter a
+number, in a commit of its own that says why. Beside the tables, ``made_on.json`` names the versions and the processor
+that made them.
 """
 
 import json
 import platform
+import sys
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -18,8 +20,6 @@ from gdptlab import Calibration, batch, datasets
 from gdptlab.experiment import Method, errors, sweep
 from gdptlab.experiment.channel import Acoustics, Focusing
 from gdptlab.experiment.film import Film
-from gdptlab.fit.field_calibration import FieldCalibration
-from gdptlab.fit.over_field import locate_over_field
 from gdptlab.locate import locate
 from gdptlab.tracking.tracks import link, velocities
 
@@ -51,12 +51,6 @@ def joint(image_type: str) -> pd.DataFrame:
     return batch([frames[10], frames[11]], sample_calibration(image_type), method="joint", progress=False)
 
 
-def over_field() -> pd.DataFrame:
-    """A frame in `data/`, fitted with amplitudes free."""
-    calibration = FieldCalibration.from_one(sample_calibration("fluorescent"))
-    return locate_over_field(datasets.sample("fluorescent").frames[0], calibration)
-
-
 def replayed() -> pd.DataFrame:
     """Errors of the trigger times of one film, refined and not."""
     calibration = sample_calibration("fluorescent")
@@ -72,8 +66,8 @@ def tracked() -> pd.DataFrame:
     """Velocities of the particles of a film."""
     frames = film()
     table = batch(list(frames), sample_calibration("fluorescent"), method="joint", progress=False)
-    tracks = link(frames.to_channel(table), frames.trajectories.focusing.channel, frames.frame_rate_hz)
-    return velocities(tracks, frames.frame_rate_hz)
+    channel, rate = frames.trajectories.focusing.channel, frames.frame_rate_hz
+    return velocities(link(frames.to_channel(table), predictor=channel, frame_rate_hz=rate), rate)
 
 
 def beads_correlation() -> pd.DataFrame:
@@ -85,15 +79,14 @@ def beads_correlation() -> pd.DataFrame:
 def beads_over_field() -> pd.DataFrame:
     """A quarter of the field of the real beads, calibrated with all beads in it."""
     beads = datasets.planar_beads()
-    calibration = FieldCalibration.from_scan(beads.scan[::2, :288, :288], beads.z_um[::2], turns=1)
-    return locate_over_field(beads.frames[8, :288, :288], calibration)
+    calibration = Calibration.from_scan(beads.scan[::2, :288, :288], beads.z_um[::2], field=True)
+    return locate(beads.frames[8, :288, :288], calibration, method="joint")
 
 
 TABLES: dict[str, Callable[[], pd.DataFrame]] = {
     **{f"refined-{t}": lambda t=t: correlation(t, refine=True) for t in IMAGE_TYPES},
     **{f"unrefined-{t}": lambda t=t: correlation(t, refine=False) for t in IMAGE_TYPES},
     **{f"joint-{t}": lambda t=t: joint(t) for t in IMAGE_TYPES},
-    "over-field": over_field,
     "replay-errors": replayed,
     "velocities": tracked,
     "beads-correlation": beads_correlation,
@@ -110,10 +103,10 @@ def made_here() -> dict[str, str]:
 
 
 def main() -> None:
-    """Store all tables."""
+    """Store the tables that are named, or all."""
     STORED.mkdir(exist_ok=True)
-    for name, compute in TABLES.items():
-        compute().to_csv(STORED / f"{name}.csv", index=False, float_format="%.10g")
+    for name in sys.argv[1:] or TABLES:
+        TABLES[name]().to_csv(STORED / f"{name}.csv", index=False, float_format="%.10g")
         print(name, flush=True)
     (STORED / "made_on.json").write_text(json.dumps(made_here(), indent=1) + "\n")
 

@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 from scipy.spatial import KDTree
 
-from gdptlab import Calibration, assessment, find_beads, locate
+from gdptlab import Calibration, assessment, locate
 from gdptlab.experiment import Camera, Microscope
-from gdptlab.pipeline.quality import depth_quality, report
+from gdptlab.pipeline import depth_quality, find_beads, report
 
 Z_UM = np.linspace(-50, 50, 26)
 PLACES = np.array([[60.3, 55.8], [180.2, 60.4], [300.7, 52.1], [58.0, 170.9], [182.6, 176.3], [205.0, 190.0]])
@@ -53,7 +53,7 @@ def test_only_beads_alone_are_used(made) -> None:
 
 def test_average_has_less_noise_than_a_bead(scan, made) -> None:
     one = Calibration.from_bead(scan, Z_UM, *PLACES[0], size=made.size)
-    assert made.own_error[:, 2].mean() < 0.75 * one.own_error[:, 2].mean()
+    assert made.model.own_error[:, 2].mean() < 0.75 * one.model.own_error[:, 2].mean()
 
 
 def test_what_is_given_is_used(scan) -> None:
@@ -74,7 +74,7 @@ def test_beads_at_other_heights_are_moved_in_z() -> None:
     higher = np.array([0.0, 0.0, 3.0])
     beads = pd.DataFrame({"x_px": places[:, 0], "y_px": places[:, 1]})
     scan = [microscope.render(beads.assign(z_um=0.9 * z - higher), SHAPE, rng=rng) for z in Z_UM]
-    table = Calibration.from_scan(np.stack(scan), Z_UM).beads.sort_values("x_px")
+    table = Calibration.from_scan(np.stack(scan), Z_UM).report.beads.sort_values("x_px")
     np.testing.assert_allclose(table["offset_um"], higher / 0.9, atol=0.5)
 
 
@@ -180,6 +180,7 @@ def test_beads_in_a_regular_array_stay_apart() -> None:
 
 def test_leaps_of_a_bead_are_told_from_drift(made) -> None:
     steady = report(made).loc["drift"]
-    leap = replace(made, drift_px=np.where(np.arange(26)[:, None] < 13, 0.0, [9.0, 0.0]))
+    drift_px = np.where(np.arange(26)[:, None] < 13, 0.0, [9.0, 0.0])
+    leap = replace(made, report=replace(made.report, drift_px=drift_px))
     assert steady["verdict"] == "good"
     assert report(leap).loc["drift", "verdict"] == "bad" and "beads_px" in report(leap).loc["drift", "advice"]

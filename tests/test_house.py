@@ -26,8 +26,8 @@ ALLOWED = {
 }
 """What each room may import, besides itself."""
 
-DOORS = {("locate", "fit"), ("calibration", "pipeline")}
-"""Modules of the core that may open a room, inside a function: for `method="joint"`, for calibrations from scans."""
+DOORS = {("locate", "fit"), ("calibration", "fit"), ("calibration", "pipeline")}
+"""Modules of the core that may open a room, inside a function: for the joint fit, for calibrations from scans."""
 
 ONE_MODULE = {("tracking/acoustic_energy", "experiment")}
 """Modules that may import a room that the rest of their own may not."""

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gdptlab.experiment.image_types import IMAGE_TYPES, Camera, as_image_type, brightfield, disturbed, fluorescent
+from gdptlab.experiment import Camera
+from gdptlab.experiment.image_types import IMAGE_TYPES, WHITE, as_image_type, brightfield, disturbed, fluorescent
 
 LIGHT = np.random.default_rng(3).uniform(0, 4000, (30, 47)).astype(np.float32)
 
@@ -26,10 +27,17 @@ def test_any_real_type_of_image(image_type, dtype):
         assert image_type(whole).dtype == np.float32
 
 
+def test_the_disturbance_can_be_seen():
+    """Its amplitude is 2 to 5 % of the empty field, as the illumination of a real condenser varies."""
+    field = disturbed(np.zeros((600, 600), np.float32))
+    amplitude = (field.max() - field.min()) / 2
+    assert 0.02 <= round(amplitude / WHITE, 4) <= 0.05
+
+
 def test_type_by_name_or_function():
     assert as_image_type("disturbed") is disturbed
     assert as_image_type(np.negative) is np.negative
-    with pytest.raises(ValueError, match=r"^image_type: got 'bright', allowed are 'fluorescent', 'brightfield', 'dis"):
+    with pytest.raises(ValueError, match="image_type"):
         as_image_type("bright")
 
 
@@ -37,7 +45,7 @@ def test_type_by_name_or_function():
 def test_disturbed_refuses_a_period_of_zero(axis):
     period = [100, 100]
     period[axis] = 0
-    with pytest.raises(ValueError, match=rf"^period_px\[{axis}\]: got 0, allowed is a finite number above 0"):
+    with pytest.raises(ValueError, match=rf"period_px\[{axis}\]"):
         disturbed(LIGHT, period_px=period)
 
 
@@ -86,13 +94,13 @@ def test_saturates_with_noise():
 @pytest.mark.parametrize("name", ["background", "read_noise", "electrons_per_count"])
 @pytest.mark.parametrize("value", [-1, np.nan, np.inf, "1"])
 def test_camera_refuses(name, value):
-    with pytest.raises(TypeError if value == "1" else ValueError, match=f"^{name}: got {value!r}, allowed is a finite"):
+    with pytest.raises(TypeError if value == "1" else ValueError, match=name):
         Camera(**{name: value})
 
 
 @pytest.mark.parametrize("bit_depth", [0, 17, 8.5, "8", None])
 def test_camera_refuses_bit_depth(bit_depth):
-    with pytest.raises(ValueError, match=f"^bit_depth: got {bit_depth!r}, allowed are whole numbers from 1 to 16"):
+    with pytest.raises(ValueError, match="bit_depth"):
         Camera(bit_depth=bit_depth)
 
 

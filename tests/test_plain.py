@@ -84,9 +84,9 @@ def test_a_frame_without_particles(calibration, refine):
 
 
 def test_bad_input(few, calibration):
-    with pytest.raises(ValueError, match=r"^correlate: got 'cv2', allowed are 'opencv', 'scikit-image'"):
+    with pytest.raises(ValueError, match="correlate"):
         locate_plainly(few[0], calibration, correlate="cv2")
-    with pytest.raises(ValueError, match=r"^image: got shape \(60, 170\)"):
+    with pytest.raises(ValueError, match="image"):
         locate_plainly(few[0].T[:60], calibration)
-    with pytest.raises(TypeError, match=r"^calibration: got a NoneType"):
+    with pytest.raises(TypeError, match="calibration"):
         locate_plainly(few[0], None)

@@ -1,11 +1,13 @@
 """The clock against frames counted by hand; the rest with an evaluator that knows the truth."""
 
+import pickle
 from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from gdptlab import _files
 from gdptlab.calibration import Calibration
 from gdptlab.experiment import replay
 from gdptlab.experiment.channel import Acoustics, Channel, Focusing
@@ -30,7 +32,7 @@ CALLS = []
 @pytest.fixture(autouse=True)
 def _own_cache(tmp_path, monkeypatch):
     """The particle images from the common cache, tables from one of the test's own."""
-    monkeypatch.setattr(replay, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(replay, "sources_folder", lambda name: tmp_path)
     CALLS.clear()
 
 
@@ -256,6 +258,37 @@ def test_all_that_matters_is_in_the_key():
         assert len(CALLS) == before + len(other)
 
 
+@pytest.mark.parametrize("change", ["sources", "versions"])
+def test_tables_of_other_software_are_not_read(change, tmp_path, monkeypatch):
+    film, method = small_film(), perfect(small_film())
+    monkeypatch.setenv("GDPTLAB_CACHE", str(tmp_path))
+    monkeypatch.setattr(replay, "sources_folder", _files.sources_folder.__wrapped__)
+    evaluate(film, [method], progress=False)
+    evaluate(film, [method], progress=False)
+    assert len(CALLS) == len(film)
+    if change == "sources":
+        monkeypatch.setattr(_files, "sources_digest", lambda: "0123456789abcdef")
+    else:
+        monkeypatch.setattr(replay, "versions", lambda: {"numpy": "9.0"})
+    evaluate(film, [method], progress=False)
+    assert len(CALLS) == 2 * len(film)
+
+
+def test_without_a_cache_folder_a_film_is_evaluated_each_time(monkeypatch):
+    film = small_film(duration_s=0.12)
+    monkeypatch.setattr(replay, "sources_folder", lambda name: None)
+    for _ in range(2):
+        evaluate(film, [perfect(film)], progress=False)
+    assert len(CALLS) == 2 * len(film)
+
+
+def test_the_name_of_a_table_is_the_same_in_any_process_and_after_use():
+    film, again = small_film(), small_film()
+    again[3]  # fills what is kept between frames
+    names = {replay._cache_name(f, perfect(f), np.arange(3)) for f in (film, again, pickle.loads(pickle.dumps(again)))}
+    assert len(names) == 1
+
+
 def test_a_stopped_sweep_goes_on(monkeypatch):
     films = [small_film(seed) for seed in (1, 2, 3)]
     method = Method(evaluator=oracle, calibration=answers(films[0]) | answers(films[1]) | answers(films[2]))
@@ -279,13 +312,13 @@ def test_a_stopped_sweep_goes_on(monkeypatch):
 def test_a_damaged_cache_is_made_anew(tmp_path):
     film = small_film()
     first = evaluate(film, [perfect(film)], progress=False)[0]
-    (path,) = (tmp_path / "replay").iterdir()
+    (path,) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:-40])
     pd.testing.assert_frame_equal(evaluate(film, [perfect(film)], progress=False)[0], first)
 
 
 def test_locate_gives_the_same_for_any_number_of_processes(monkeypatch):
-    monkeypatch.setattr(replay, "_BLOCK", 3)
+    monkeypatch.setattr(replay, "FRAMES_PER_JOB", 3)
     film = small_film(mean_in_view=15)
     methods = replay.grid(locate, partial(Calibration.from_stack, *film.stack(11, 41)), n=(11,), n_sub=(6, 12))
     assert [m.label for m in methods] == [{"n": 11, "n_sub": 6, "refine": r} for r in (True, False)]
@@ -335,11 +368,11 @@ def test_an_evaluator_may_see_nothing_and_say_so_without_types():
 @pytest.mark.parametrize(
     ("method", "error", "match"),
     [
-        (Method(evaluator=no_table), TypeError, "list"),
+        (Method(evaluator=no_table), TypeError, "evaluator"),
         (Method(evaluator=no_depth), ValueError, "z_um"),
-        (Method(evaluator=words), TypeError, "columns of numbers"),
-        (Method(evaluator=no_depth, calibration=object()), TypeError, "cache=False"),
-        (Method(evaluator=partial(no_depth)), TypeError, "cache=False"),
+        (Method(evaluator=words), TypeError, "evaluator"),
+        (Method(evaluator=no_depth, calibration=object()), TypeError, "method"),
+        (Method(evaluator=partial(no_depth)), TypeError, "evaluator"),
         (no_depth, TypeError, "methods"),
     ],
 )
@@ -357,11 +390,11 @@ def test_arguments_of_sweeps_that_cannot_be():
         evaluate(film, [method], n_jobs=0)
     with pytest.raises(ValueError, match="every"):
         evaluate(film, [method], every=0)
-    with pytest.raises(ValueError, match="differ in seed"):
+    with pytest.raises(ValueError, match="films"):
         sweep([film, film], [method])
-    with pytest.raises(ValueError, match="one or more"):
+    with pytest.raises(ValueError, match="films"):
         sweep([], [method])
-    with pytest.raises(ValueError, match="one or more"):
+    with pytest.raises(ValueError, match="methods"):
         sweep([film], [])
     for level in (0, 1.1, -1, np.nan):
         with pytest.raises(ValueError, match="level"):

@@ -1,4 +1,4 @@
-"""The paper's experiment: microscope, kinds of image, channel, film, and the clock of camera and monitor."""
+"""The paper's experiment: microscope, image types, channel, film, and the clock of camera and monitor."""
 
 import lazy_loader
 

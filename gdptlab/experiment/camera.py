@@ -17,10 +17,10 @@ class Camera:
     background : float
         Counts of a pixel without light.
     read_noise : float
-        Standard deviation of the Gaussian noise of a pixel, counts. With the default microscope the
-        dimmest particle of the channel (z = +50 µm) peaks ten times as high.
+        Standard deviation of the Gaussian noise of a pixel, counts. With the default microscope, the peak of the
+        dimmest particle in the channel (z = +50 µm) is ten times as high.
     electrons_per_count : float or None
-        Photo-electrons behind one count of light; light then carries Poisson noise. None: no photon noise.
+        Number of photo-electrons in one count of light; light then has Poisson noise. None: no photon noise.
     bit_depth : int
         Counts are rounded and cut off at 2**bit_depth - 1 (at most 16).
     """
@@ -39,14 +39,14 @@ class Camera:
             raise ValueError(f"bit_depth: got {self.bit_depth!r}, allowed are whole numbers from 1 to 16")
 
     def record(self, light: NDArray, rng: np.random.Generator | int | None = None) -> NDArray[np.uint16]:
-        """Turn light into a frame.
+        """Record light as a frame of counts.
 
         Parameters
         ----------
         light : array (rows, columns)
-            Expected counts above the background; below zero is taken as no light.
+            Expected counts above the background; counts below 0 are taken as 0.
         rng : numpy Generator or int, optional
-            Source of the noise. Without it the frame is the one a noiseless camera would take.
+            Source of the noise; without it the frame has none.
 
         Returns
         -------

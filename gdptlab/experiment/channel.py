@@ -4,9 +4,9 @@ Axes: x points downstream, y across the width w, z across the height h; y = z = 
 and the field of view is 0 ≤ x ≤ `view_length_um`. Lengths are in µm, times in s, speeds in µm/s.
 
 All particles are alike. They move with the fluid along x, and across it at the radiation velocity of
-eqs (1a, 1b) of Rossi & Barnkob. As in the paper there is no streaming and no gravity (a 5 µm polystyrene
-sphere sinks at about 0.8 µm/s), nor do particles feel the walls or each other. So y and z have closed
-forms, and only x needs a quadrature.
+eqs (1a, 1b) of Rossi & Barnkob. As in the paper there is no streaming, no gravity (a 5 µm polystyrene
+sphere sinks at about 0.8 µm/s), and no interaction of particles with the walls or with each other. So y and z
+have closed forms, and only x needs a quadrature.
 """
 
 from dataclasses import dataclass, field, fields
@@ -21,8 +21,13 @@ from scipy.interpolate import CubicSpline, PPoly
 
 from gdptlab._checks import choice, positive
 
-_TERMS = 100  # of the Poiseuille series: error 4e-6 of the peak on a wall, 1e-10 one particle radius off it
-_KNOTS = 10  # of the path integral, per focusing time: error 2e-6 µm in 20 s
+TERMS = 100
+"""Number of terms of the Poiseuille series. Chosen on the paper's channel: the error is 2e-6 of the peak speed on a
+wall and 3e-12 one particle radius off it; with 10 terms, 5e-4 and 6e-5. More terms only take time."""
+
+KNOTS = 10
+"""Number of knots of the path integral in one focusing time. Chosen on 20 s in the paper's channel: the error is
+2e-6 µm with 10 knots, 6e-5 µm with 5 and 8e-4 µm with 3. More knots only take time."""
 
 
 def _positive_fields(obj: Any) -> None:
@@ -33,12 +38,13 @@ def _positive_fields(obj: Any) -> None:
 
 
 def _instance(name: str, value: Any, kind: type) -> None:
+    """Refuse a value that is not of this class."""
     if not isinstance(value, kind):
         raise TypeError(f"{name}: got {value!r}, allowed is a {kind.__name__}")
 
 
 def _within(name: str, value: ArrayLike, limit: float) -> NDArray[np.float64]:
-    """Return `value` as an array if, but for rounding, all of it lies within ± `limit` µm."""
+    """Return `value` as an array of its shape if all of it, but for rounding, lies within ± `limit` µm."""
     array = np.asarray(value, dtype=float)
     outside = ~(np.abs(array) <= limit * (1 + 1e-12))  # in this form NaN is outside
     if outside.any():
@@ -81,12 +87,12 @@ class Channel:
         return float(self.velocity(0.0, 0.0))
 
     def velocity(self, y_um: ArrayLike, z_um: ArrayLike) -> NDArray[np.float64]:
-        """Poiseuille velocity along x, in µm/s, at points inside the channel (y and z broadcast together).
+        """Return the Poiseuille velocity along x, in µm/s, at points in the channel (y and z broadcast together).
 
         This is the single Fourier series of the rectangular duct (Bruus, Theoretical Microfluidics, 2008,
-        section 3.4.4), its plane part summed to the parabola over the shorter side. The rest corrects for
-        the other two walls and dies off exponentially away from them, where a double series needs thousands
-        of terms. Divided by its own mean, which has a closed form, and scaled to Q.
+        section 3.4.4), its plane part summed to the parabola over the shorter side. The other part corrects for
+        the two other walls and decays exponentially away from them, where a double series needs thousands
+        of terms. The profile is divided by its own mean, which has a closed form, and scaled to Q.
 
         Raises
         ------
@@ -98,7 +104,7 @@ class Channel:
         long, short = self.width_um, self.height_um
         if long < short:
             along, across, long, short = across, along, short, long
-        n = 2 * np.arange(_TERMS) + 1
+        n = 2 * np.arange(TERMS) + 1
         sign = np.where(n % 4 == 1, 1, -1)
         weight = sign * 32 / (np.pi * n) ** 3 / (1 + np.exp(-n * np.pi * long / short))
         profile = 1 - (2 * across / short) ** 2
@@ -118,7 +124,7 @@ class Suspension:
     radius_um : float
         a of eqs (1a, 1b) (paper, section 4: 2a = 5 µm).
     density_kg_m3, compressibility_per_TPa : float
-        Of the spheres; not in the paper. Density 1050, longitudinal sound speed c = 2350 m/s and Poisson's
+        Of the spheres; the paper does not give them. Density 1050, longitudinal sound speed c = 2350 m/s and Poisson's
         ratio s = 0.35 of polystyrene (Muller et al., Lab Chip 12 (2012) 4617) give a compressibility
         3 (1 - s) / (1 + s) / (ρ c²) = 249 per TPa. Published values run from 172 to 330.
     fluid_density_kg_m3, sound_speed_m_s, viscosity_mPa_s : float
@@ -209,11 +215,11 @@ class Focusing:
         return {"y": self.channel.width_um, "z": self.channel.height_um}[choice("axis", axis, "yz")]
 
     def free_um(self, axis: str) -> float:
-        """How far from the middle a particle's centre can be: half the extent less one radius."""
+        """Largest distance of a particle's centre from the middle: half the extent less one radius."""
         return self.extent_um(axis) / 2 - self.suspension.radius_um
 
     def amplitude_um_s(self, axis: str) -> float:
-        """U = u_0 a²/a_0² of eq. (1a) for y, (1b) for z.
+        """Amplitude of the radiation velocity, U = u_0 a²/a_0² of eq. (1a) for y, (1b) for z, in µm/s.
 
         With u_0 = 4 E_ac / (ρ c) and a_0² = 6 ν / (Φ ω) (Muller et al., Phys. Rev. E 88 (2013) 023006) and
         ω = k c, this is (2 Φ / 3) (a² / η) k E_ac; k = π / extent for a half wave.
@@ -228,13 +234,13 @@ class Focusing:
         return self.extent_um(axis) / (2 * np.pi * self.amplitude_um_s(axis))
 
     def radiation_velocity(self, axis: str, position_um: ArrayLike) -> NDArray[np.float64]:
-        """Eqs (1a, 1b) in µm/s: U sin[π(2y/w + 1)], that is -U sin(2πy/w), towards the centre."""
+        """Return the velocity of eqs (1a, 1b) in µm/s: U sin[π(2y/w + 1)] = -U sin(2πy/w), towards the centre."""
         extent = self.extent_um(axis)
         position = _within("position_um", position_um, extent / 2)
         return self.amplitude_um_s(axis) * np.sin(np.pi * (2 * position / extent + 1))
 
     def path(self, axis: str, start_um: ArrayLike, t_s: ArrayLike) -> NDArray[np.float64]:
-        """Position in µm at `t_s` of particles that were at `start_um` at t = 0 (broadcast together).
+        """Return the position in µm at `t_s` of particles that were at `start_um` at t = 0 (broadcast together).
 
         Solves dy/dt = -U sin(2πy/w): tan(πy/w) = tan(πy_0/w) exp(-2πUt/w).
         """
@@ -243,7 +249,7 @@ class Focusing:
         return extent / np.pi * np.arctan(start * np.exp(-np.asarray(t_s) / self.focusing_time_s(axis)))
 
     def arrival_time(self, axis: str, start_um: ArrayLike) -> NDArray[np.float64]:
-        """Time in s to reach the middle third from `start_um`: 0 inside it, inf from the wall itself."""
+        """Return the time in s to reach the middle third from `start_um`: 0 inside it, inf from the wall itself."""
         extent = self.extent_um(axis)
         start = np.abs(_within("start_um", start_um, extent / 2))
         ratio = np.maximum(np.tan(np.pi * start / extent) / np.tan(np.pi / 6), 1.0)
@@ -257,10 +263,10 @@ class Focusing:
         start_um: ArrayLike | None = None,
         wall_gap_um: float | None = None,
     ) -> float:
-        """When `fraction` of the particles are in the middle third: t_{w/3} for 'y', t_{h/3} for 'z'.
+        """Return when `fraction` of the particles are in the middle third: t_{w/3} for 'y', t_{h/3} for 'z'.
 
-        Who starts nearer to the centre arrives first, so one particle decides: the one at that rank of
-        distance from the centre.
+        A particle that starts nearer to the centre arrives earlier, so the particle at that rank of distance from the
+        centre decides.
 
         Parameters
         ----------
@@ -270,7 +276,7 @@ class Focusing:
         start_um : array_like, optional
             Start of each particle along `axis`. Without it: infinitely many, evenly spread.
         wall_gap_um : float, optional
-            How far off the walls those keep; by default their radius. 0 is the whole cross-section.
+            Distance that those particles keep from the walls; by default their radius. 0: the whole cross-section.
 
         Returns
         -------
@@ -351,15 +357,16 @@ class Trajectories:
     ) -> Self:
         """Draw particles evenly over the cross-section, and along x from far enough upstream.
 
-        Far enough is the peak speed times `duration_s`. How far a particle drifts does not depend on its
-        start along x, so at any time the view holds an even draw of all paths: the count in it stays binomial
-        around `mean_in_view`, and its fraction in the middle thirds is that of the whole population.
+        Far enough is the peak speed times `duration_s`. How far a particle drifts does not depend on its start along x,
+        so the view holds an even draw of all paths at any time: its count varies around `mean_in_view`, and its
+        fraction in the middle thirds is that of the whole population. Particles are drawn stretch by stretch, upstream
+        from the view, so that a longer film begins with the particles of a shorter one.
 
         Parameters
         ----------
         focusing : Focusing
         rng : int or numpy.random.Generator
-            The same seed gives the same table, bit for bit.
+            The same seed gives the same table, bit for bit, and the same first particles for any duration.
         mean_in_view : float
             Expected number of particles in the field of view.
         duration_s, view_length_um : float
@@ -378,48 +385,55 @@ class Trajectories:
             raise TypeError(f"rng: got {rng!r}, allowed is an integer seed or a numpy Generator")
         if isinstance(rng, Integral) and rng < 0:
             raise ValueError(f"rng: got {rng!r}, allowed is a seed of at least 0")
-        border = positive("border_um", border_um, zero=True)
+        border, view = positive("border_um", border_um, zero=True), positive("view_length_um", view_length_um)
+        density = positive("mean_in_view", mean_in_view) / view
         drift = focusing.channel.max_speed_um_s * positive("duration_s", duration_s)
-        length = positive("view_length_um", view_length_um) + 2 * border + drift
-        count = round(positive("mean_in_view", mean_in_view) * length / view_length_um)
-        if count == 0:
-            least = view_length_um / length  # one particle in all
-            raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed is {least:.2g} or more")
-        half = [focusing.free_um("y"), focusing.free_um("z")]
-        low, high = [-border - drift, -half[0], -half[1]], [view_length_um + border, *half]
-        xyz = np.random.default_rng(rng).uniform(low, high, size=(count, 3))
-        start = pd.DataFrame(xyz, columns=["x_um", "y_um", "z_um"]).assign(particle=np.arange(count))
+        # Stretches from the downstream end: the view with its borders, then as many views as the drift needs.
+        ends = view + 2 * border + view * np.arange(1 + np.ceil(drift / view))
+        starts, counts = np.concatenate([[0.0], ends[:-1]]), np.diff(np.rint(density * ends), prepend=0).astype(int)
+        generator, half = np.random.default_rng(rng), [focusing.free_um("y"), focusing.free_um("z")]
+        xyz = np.concatenate(
+            [
+                generator.uniform([view + border - b, -half[0], -half[1]], [view + border - a, *half], size=(n, 3))
+                for a, b, n in zip(starts, ends, counts, strict=True)
+            ]
+        )
+        start = pd.DataFrame(xyz, columns=["x_um", "y_um", "z_um"]).assign(particle=np.arange(len(xyz)))
+        start = start[start["x_um"] >= -border - drift]
+        if start.empty:
+            least = view / ends[0]
+            raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed is {least:.2g} or more, one particle in all")
         return cls(focusing=focusing, start=start, duration_s=duration_s, view_length_um=view_length_um)
 
     @cached_property
     def _drift(self) -> PPoly:
-        """How far each particle has gone along x, as a piecewise polynomial of time.
+        """Distance of each particle (n,) along x from its start, µm, as a piecewise polynomial of time.
 
         The flow's velocity is taken along the closed-form path across, splined and integrated. Knots follow
         the faster axis until it is focused to 1e-11, then the slower one; after that nothing changes.
         """
         scale = np.sort([self.focusing.focusing_time_s(axis) for axis in "yz"])
         ends = [0.0, *np.minimum(25 * scale, self.duration_s), self.duration_s]
-        steps = [*scale / _KNOTS, self.duration_s / _KNOTS]
+        steps = [*scale / KNOTS, self.duration_s / KNOTS]
         parts = zip(ends[:-1], ends[1:], steps, strict=True)
         pieces = [np.linspace(a, b, 2 + int((b - a) / step)) for a, b, step in parts]
         t = np.unique(np.concatenate(pieces))
         return CubicSpline(t, self.focusing.channel.velocity(*self._across(t))).antiderivative()
 
     def _across(self, t_s: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """y and z, each of shape (times, particles)."""
+        """Return y and z at these times (k,), each of shape (k, particles)."""
         return [self.focusing.path(axis, self.start[f"{axis}_um"], t_s[:, None]) for axis in "yz"]
 
     def table(self, times_s: ArrayLike, *, border_um: float = 0.0) -> pd.DataFrame:
-        """Positions at many times.
+        """Return positions at many times.
 
         Parameters
         ----------
         times_s : array_like, shape (frames,)
             From 0 to `duration_s`.
         border_um : float
-            Keep particles up to here beyond either end of the view (the density holds up to the border given
-            to `seeded`); inf: every one, wherever it is.
+            Largest distance beyond either end of the view of the particles to keep (the density holds up to the border
+            given to `seeded`); inf: all particles, wherever they are.
 
         Returns
         -------
@@ -443,9 +457,9 @@ class Trajectories:
         return pd.DataFrame(columns | xyz)
 
     def positions(self, t_s: float, *, border_um: float = 0.0) -> pd.DataFrame:
-        """Positions at one time, about 1 ms each: the columns of `table` but for `frame`."""
+        """Return positions at one time, in about 1 ms: the columns of `table` but for `frame`."""
         return self.table([t_s], border_um=border_um).drop(columns="frame")
 
     def trigger_time(self, axis: str, fraction: float = 0.9) -> float:
-        """Exact trigger time in s of all these particles, in view or not: see `Focusing.trigger_time`."""
+        """Return the exact trigger time in s of all particles, in view or not: see `Focusing.trigger_time`."""
         return self.focusing.trigger_time(axis, fraction, start_um=self.start[f"{axis}_um"])

@@ -1,7 +1,7 @@
 """The paper's experiment as its camera sees it: frames rendered when they are asked for, and the truth.
 
-The frame shows the whole width of the channel, its middle on the middle row; the left edge of the first
-column is x = 0. Depths are the same in the channel, in the frames' truth and in the calibration stack.
+The frame shows the whole width of the channel, and the channel's middle lies on the middle row; the left edge of the
+first column is x = 0. Depths are the same in the channel, in the frames' truth and in the calibration stack.
 """
 
 from collections.abc import Iterator
@@ -19,23 +19,25 @@ from gdptlab.experiment.image_types import IMAGE_TYPES
 from gdptlab.experiment.microscope import Microscope
 
 BORDER_UM = 30.0
-"""Particles up to here beyond the frame are rendered too: a defocused image is up to 60 px wide."""
+"""Distance, µm, beyond the frame up to which particles are rendered. Derived from the default microscope: the widest
+image, 58 px at z = 50 µm, reaches 19 µm from its centre. With 0, a frame's edge would lack the light of particles just
+outside; with more, particles are rendered that do not show."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Film:
-    """A film of particles in a channel: `len(film)`, `film[i]` and a loop give frames, none is kept.
+    """A film of particles in a channel: `len(film)`, `film[i]` and a loop give frames, which are not kept.
 
-    A frame depends on the fields and its number only, noise included, whatever is rendered before it.
+    A frame, noise included, depends on the fields and on its number only, not on what was rendered before.
 
     Attributes
     ----------
     trajectories : Trajectories
-        They also say for how long, and how long a view.
+        Paths of the particles, duration, and length of the view.
     microscope : Microscope
     camera : Camera
     image_type : str
-        A name in `imagetypes.IMAGE_TYPES`.
+        A name in `image_types.IMAGE_TYPES`.
     frame_rate_hz : float
         Frame i is taken at t = i / frame_rate_hz (paper, section 4: 25).
     shape : (rows, columns)
@@ -97,9 +99,10 @@ class Film:
         frame_rate_hz: float = 25.0,
         shape: tuple[int, int] = (512, 512),
     ) -> Self:
-        """Film of freshly drawn particles; by default the paper's experiment.
+        """Draw particles, and return their film; by default the paper's experiment.
 
-        Films that differ in nothing but `image_type` show the same particles, with the same read noise.
+        Films that differ in `image_type` only show the same particles, with the same read noise. Films that differ in
+        `duration_s` only begin with the same frames: up to 1e-5 µm in x, one count in a pixel.
 
         Parameters
         ----------
@@ -138,7 +141,8 @@ class Film:
         )
 
     def __len__(self) -> int:
-        return int(self.trajectories.duration_s * self.frame_rate_hz + 1e-9)  # 0.28 * 25 is a little above 7
+        """Return the number of frames."""
+        return int(self.trajectories.duration_s * self.frame_rate_hz + 1e-9)  # of whole frames, but for rounding
 
     def __getitem__(self, frame: int) -> NDArray[np.uint16]:
         """Render one frame, array (rows, columns); negative numbers count from the end."""
@@ -155,11 +159,11 @@ class Film:
 
     @property
     def times_s(self) -> NDArray[np.float64]:
-        """When each frame is taken, (frames,)."""
+        """Times of the frames, (frames,)."""
         return np.arange(len(self)) / self.frame_rate_hz
 
     def truth(self) -> pd.DataFrame:
-        """Where the particles are whose centres lie in the frame.
+        """Return the positions of all particles whose centres lie in the frame.
 
         Returns
         -------
@@ -175,7 +179,7 @@ class Film:
         Parameters
         ----------
         table : DataFrame
-            With columns `x_px`, `y_px`; `z_um` is the channel's already.
+            With columns `x_px`, `y_px`; `z_um` is the same in the channel.
 
         Returns
         -------
@@ -196,18 +200,19 @@ class Film:
         return table.assign(x_um=(x_px + 0.5) * scale, y_um=(y_px - middle) * scale, **stds)
 
     def _to_pixels(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Add `x_px`, `y_px` to a table in the channel's coordinates."""
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2
         return table.assign(x_px=table["x_um"] / scale - 0.5, y_px=table["y_um"] / scale + middle)
 
     def stack(self, n: int = 51, size: int = 61, seed: int = 0) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
-        """Calibration stack in this film's image type, from the channel's floor to its ceiling.
+        """Return a calibration stack in this film's image type, from the channel's floor to its ceiling.
 
-        As in a laboratory it is recorded once: it is the same for films of any seed.
+        It is recorded once, as in a laboratory: it is the same for films of any seed.
 
         Parameters
         ----------
         n : int
-            Images, N of the paper (its most: 51).
+            Number of images, N of the paper (51 at most).
         size : int
             Rows and columns of an image, odd.
         seed : int
@@ -234,6 +239,7 @@ class Film:
 
 
 def _checked_shape(shape: tuple[int, int]) -> tuple[int, int]:
+    """Return `shape` if it is a pair (rows, columns) of whole numbers."""
     if not isinstance(shape, tuple) or len(shape) != 2:
         raise TypeError(f"shape: got {shape!r}, allowed is a pair (rows, columns)")
     return whole("shape[0]", shape[0], 1, 2**20), whole("shape[1]", shape[1], 1, 2**20)

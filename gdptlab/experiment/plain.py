@@ -1,9 +1,9 @@
-"""The paper's method written down with a library's normalised correlation, to hold `locate` against.
+"""The paper's method written with the normalised correlation of a library: the reference of `locate`.
 
-Every template of the subset is correlated with the whole frame at full resolution, one call for each; candidates
-are refined one after the other. That is what one would write first, and what `locate` must agree with. Where it
-differs otherwise: profiles are read at the pixel of the peak alone, and parts of pixels and of steps in z come
-from parabolas through three correlations, not from least squares.
+One call correlates each template of the subset with the whole frame at full resolution; candidates are refined one
+after the other. `locate` must agree with this. It differs in two more points: here, profiles are read at the pixel of
+the peak only, and positions between pixels and between slices come from parabolas through three correlations, there
+from least squares.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,10 @@ from gdptlab.calibration import Calibration
 from gdptlab.correlation import standardised, strongest, vertex
 from gdptlab.locate import as_table, checked_frame
 
-REACH_PX = 2
-"""How far from a candidate's pixel the refinement looks."""
+HALF_WIDTH_PX = 2
+"""Half-width, px, of the window around a candidate's pixel in which the refinement searches. Chosen: the peaks of
+neighbouring slices are less than a pixel apart. With 0, the refinement could not leave the pixel; with half a template,
+it would climb to another particle."""
 
 Correlate = Callable[[NDArray, NDArray], NDArray]
 
@@ -49,7 +51,7 @@ def locate_plainly(
         As in `locate`.
     calibration : Calibration
     correlate : {"opencv", "scikit-image"}
-        Which library correlates: `cv2.matchTemplate` or `skimage.feature.match_template`.
+        Library that correlates: with `cv2.matchTemplate` or `skimage.feature.match_template`.
     threshold, refine, min_distance_px
         As in `locate`.
 
@@ -72,30 +74,30 @@ def locate_plainly(
     peak[[0, -1]] = peak[:, [0, -1]] = False
     row, column = np.nonzero(peak)
 
-    # Both at full resolution, and both free of the stack's noise, which would make the diagonal stand out.
+    # At full resolution and without the stack's noise, which would enlarge the correlation of a slice with itself.
     expected = calibration.self_similarity()[:, calibration.subset]
-    likeness = standardised(maps[:, row, column].T) @ standardised(expected).T
-    k = np.clip(likeness.argmax(axis=1), 1, last - 1)
-    step = k + vertex(likeness[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
+    correlation = standardised(maps[:, row, column].T) @ standardised(expected).T
+    k = np.clip(correlation.argmax(axis=1), 1, last - 1)
+    slice_ = k + vertex(correlation[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
     if refine:
-        starts = zip(row, column, np.rint(step).astype(int), strict=True)
+        starts = zip(row, column, np.rint(slice_).astype(int), strict=True)
         found = [_climbed(image, templates, *start, correlated) for start in starts]
     else:
         best = maps[:, row, column].argmax(axis=0)
-        found = [(*_top(maps[b], r, c), s) for b, r, c, s in zip(best, row, column, step, strict=True)]
-    y, x, cm, step = np.array(found).reshape(-1, 4).T
-    place = np.stack([y, x], axis=1) + half
-    kept = strongest(place, np.where(cm >= threshold, cm, 0), distance)
-    return as_table(place[kept], step[kept], cm[kept], calibration.z_um)
+        found = [(*_top(maps[b], r, c), s) for b, r, c, s in zip(best, row, column, slice_, strict=True)]
+    y, x, cm, slice_ = np.array(found).reshape(-1, 4).T
+    position = np.stack([y, x], axis=1) + half
+    kept = strongest(position, np.where(cm >= threshold, cm, 0), distance)
+    return as_table(position[kept], slice_[kept], cm[kept], calibration.z_um)
 
 
 def _climbed(
     image: NDArray[np.float32], templates: NDArray[np.float32], row: int, column: int, k: int, correlated: Correlate
 ) -> tuple[float, float, float, float]:
-    """Walk from template k to the best C_m near a pixel of the maps: row, column, C_m (0: it is elsewhere), step."""
+    """Walk from template k to the best C_m near a pixel: row and column in the maps, C_m (0: not a peak), slice."""
     n = templates.shape[-1]
-    first = max(row - REACH_PX, 0), max(column - REACH_PX, 0)
-    window = image[first[0] : row + REACH_PX + n, first[1] : column + REACH_PX + n]
+    first = max(row - HALF_WIDTH_PX, 0), max(column - HALF_WIDTH_PX, 0)
+    window = image[first[0] : row + HALF_WIDTH_PX + n, first[1] : column + HALF_WIDTH_PX + n]
     map_ = cache(lambda k: correlated(window, templates[k]))
     while True:
         around = [i for i in (k, k - 1, k + 1) if 0 <= i < len(templates)]
@@ -112,6 +114,6 @@ def _climbed(
 
 
 def _top(map_: NDArray, r: int, c: int) -> tuple[float, float, float]:
-    """Peak of a map at (r, c): row and column, between pixels, and value, at the pixel."""
+    """Return row and column, between pixels, of the peak of a map at pixel (r, c), and the map's value there."""
     part = vertex(np.stack([map_[r - 1 : r + 2, c], map_[r, c - 1 : c + 2]]))
     return r + part[0], c + part[1], map_[r, c]

@@ -4,24 +4,21 @@ A monitor takes the camera's newest frame as soon as it is free, is busy for the
 the newest again; frames in between are dropped. It fires when 90 % of the particles it measured are in the
 middle third of the height (trigger 'h', the paper's t_{h/3}) or of the width ('w', t_{w/3}).
 
-What a frame's evaluation finds does not depend on τ. So `sweep` evaluates the frames of many films in many
-ways, each frame rendered once for all of them, and keeps what it found on disk; `watch` is the clock; `errors`
-lets it run over that table for any τ and any moment of switching on.
+The result of evaluating a frame does not depend on τ. So `sweep` evaluates the frames of many films in many ways,
+renders each frame once for all of them, and keeps the tables on disk; `watch` is the clock; `errors` lets the clock
+run over those tables for any τ and any moment of switching on.
 
-Any function with the signature of `locate` can be the evaluator: here nothing is known of how it works.
+Any function with the signature of `locate` can be the evaluator.
 """
 
-import hashlib
 import inspect
 import sys
 import time
-import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
+import joblib
 import numpy as np
 import pandas as pd
 from joblib import Parallel, delayed
@@ -29,14 +26,14 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from gdptlab._checks import positive, whole
-from gdptlab._files import cache_folder, written_whole
+from gdptlab._files import kept_arrays, sources_folder, written_whole
+from gdptlab._versions import versions
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
 
-VERSION = 6
-"""Part of every cache key: to be raised when films, or what an evaluator calls, give other results."""
-
-_BLOCK = 25  # frames per job: long against what it costs to hand a job to a worker
+FRAMES_PER_JOB = 25
+"""Number of frames that one job of a worker process holds; no result depends on it. Chosen: to hand a job over takes
+some ms, which is little beside 25 frames of 10 ms; with thousands, a film of 500 frames would not fill two cores."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,11 +45,11 @@ class Method:
     evaluator : callable
         (image, calibration, **settings) -> DataFrame with at least `x_px`, `y_px`, `z_um`, like `locate`.
     calibration : object
-        Whatever the evaluator takes.
+        Second argument of the evaluator.
     settings : mapping
         Its keyword arguments.
     label : mapping
-        Columns, and their values, by which tables tell this method from others.
+        Columns, and their values, that tell this method from others in tables.
     """
 
     evaluator: Callable[..., pd.DataFrame]
@@ -147,7 +144,8 @@ def evaluate(
     n_jobs : int
         Processes; -1 for one per core. The result does not depend on it.
     cache : bool
-        Look for each method's table in the cache folder, and put it there.
+        Look for each method's table in the cache folder, and put it there. The tables are read again only by the
+        same sources and versions of all packages.
     progress : bool
         Show a progress bar.
 
@@ -168,36 +166,37 @@ def evaluate(
         if not isinstance(method, Method):
             raise TypeError(f"methods: got {method!r} in it, allowed are Methods")
     frames = evaluated_frames(film, every)
-    paths = [_cache_path(film, method, frames) if cache else None for method in methods]
-    tables = [_load(path) if path else None for path in paths]
+    folder = sources_folder("replay") if cache else None
+    paths = [folder / _cache_name(film, method, frames) if folder else None for method in methods]
+    # `joblib.Memory` would keep the result of one call; here one pass over the film serves all missing tables.
+    tables = [kept_arrays(path) if path else None for path in paths]
     missing = [i for i, table in enumerate(tables) if table is None]
     if not missing:
-        return tables
+        return [pd.DataFrame(table) for table in tables]
     todo = [methods[i] for i in missing]
-    # The first frame here, so that workers get calibrations whose lazy parts are there already.
+    # This process evaluates the first frame, so that workers get calibrations whose lazy parts are there already.
     parts = [_evaluated(film, todo, frames[:1])]
-    blocks = [frames[k : k + _BLOCK] for k in range(1, len(frames), _BLOCK)]
+    blocks = [frames[k : k + FRAMES_PER_JOB] for k in range(1, len(frames), FRAMES_PER_JOB)]
     jobs = Parallel(n_jobs=n_jobs, return_as="generator")(delayed(_evaluated)(film, todo, block) for block in blocks)
     with tqdm(total=len(frames), initial=1, desc="frames", unit="frame", leave=False, disable=not progress) as bar:
         for block, part in zip(blocks, jobs, strict=True):
             parts.append(part)
             bar.update(len(block))
     for i, *pieces in zip(missing, *parts, strict=True):
-        columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+        tables[i] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
         if paths[i]:
             with written_whole(paths[i]) as temporary:
-                np.savez_compressed(temporary, **columns)
-        tables[i] = pd.DataFrame(columns)
-    return tables
+                np.savez_compressed(temporary, **tables[i])
+    return [pd.DataFrame(table) for table in tables]
 
 
 def evaluated_frames(film: Film, every: int = 1) -> NDArray[np.int64]:
-    """Numbers of the frames that `evaluate` looks at."""
+    """Return the numbers of the frames that `evaluate` looks at, (n,)."""
     return np.arange(0, len(film), whole("every", every, 1, len(film)))
 
 
 def _evaluated(film: Film, methods: Sequence[Method], frames: NDArray[np.int64]) -> list[dict[str, NDArray]]:
-    """Columns of each method's table over some frames."""
+    """Return the columns of each method's table over the frames with these numbers (n,)."""
     found: list[list[pd.DataFrame]] = [[] for _ in methods]
     for frame in frames.tolist():
         image = film[frame]
@@ -210,62 +209,45 @@ def _evaluated(film: Film, methods: Sequence[Method], frames: NDArray[np.int64])
     ]
 
 
-def _load(path: Path) -> pd.DataFrame | None:
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return pd.DataFrame({name: file[name] for name in file.files})
-    except (OSError, ValueError, EOFError, BadZipFile, zlib.error):  # not there, or damaged
-        return None
+def _cache_name(film: Film, method: Method, frames: NDArray[np.int64]) -> str:
+    """Return the name of a table's file: a hash of all that the table depends on, besides the package's sources."""
+    parts = versions(), film, frames, _source(method.evaluator), method.calibration, method.settings
+    return f"{joblib.hash([_plain(part) for part in parts])}.npz"
 
 
-def _cache_path(film: Film, method: Method, frames: NDArray[np.int64]) -> Path:
-    """Where a table is kept: under a hash of all that it depends on."""
-    digest = hashlib.sha256()
-    evaluator = method.evaluator
-    for part in (VERSION, film, frames, _source(evaluator), method.calibration, method.settings):
-        _feed(digest, part)
-    folder = cache_folder() / "replay"
-    folder.mkdir(exist_ok=True)
-    return folder / f"{digest.hexdigest()[:32]}.npz"
-
-
-def _source(evaluator: Callable) -> tuple[str, str]:
-    """Name and code of a function (its whole module, unless that is a notebook)."""
+def _source(evaluator: Callable) -> list[str]:
+    """Return name and code of a function (of its whole module, unless that is a notebook)."""
     try:
         module = sys.modules[evaluator.__module__]
-        return evaluator.__qualname__, inspect.getsource(module if hasattr(module, "__file__") else evaluator)
+        return [evaluator.__qualname__, inspect.getsource(module if hasattr(module, "__file__") else evaluator)]
     except (AttributeError, KeyError, OSError, TypeError) as error:
         raise TypeError(f"evaluator: got {evaluator!r}, allowed is a plain function, or cache=False") from error
 
 
-def _feed(digest: Any, value: Any) -> None:
-    """Add a value to a hash such that equal values give equal hashes, in any process."""
+def _plain(value: Any) -> Any:
+    """Return a value as new dicts and lists of arrays, numbers and text, whose hash is the same in any process."""
     if isinstance(value, pd.DataFrame):
         value = {name: value[name].to_numpy() for name in value}
-    digest.update(f"({type(value).__name__}".encode())
     if is_dataclass(value) and not isinstance(value, type):
-        value = {f.name: getattr(value, f.name) for f in fields(value) if not f.name.startswith("_")}
+        public = {f.name: getattr(value, f.name) for f in fields(value) if not f.name.startswith("_")}
+        value = {"class": type(value).__qualname__, **public}
     if isinstance(value, Mapping):
-        value = [item for name in sorted(value) for item in (name, value[name])]
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
     if isinstance(value, np.ndarray) and value.dtype.kind != "O":
-        digest.update(repr((value.dtype.str, value.shape)).encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, list | tuple):
-        for item in value:
-            _feed(digest, item)
-    elif value is None or isinstance(value, str | bool | int | float | np.number | np.bool_):
-        digest.update(repr(value).encode())
-    else:
-        raise TypeError(
-            f"method: got {value!r} in it, allowed are numbers, text, arrays and dataclasses, or cache=False"
-        )
-    digest.update(b")")
+        return value
+    raise TypeError(f"method: got {value!r} in it, allowed are numbers, text, arrays and dataclasses, or cache=False")
 
 
 def durations(film: Film, methods: Sequence[Method], *, count: int = 20, progress: bool = True) -> pd.DataFrame:
-    """Measure evaluation times τ, one frame after another in this process, with nothing else running in it.
+    """Measure evaluation times τ, one frame after another, in this process.
 
-    Times taken while other processes evaluate would be longer, so `evaluate` takes none.
+    `evaluate` measures no times, since its worker processes slow each other down.
 
     Parameters
     ----------
@@ -304,9 +286,9 @@ def sweep(
     cache: bool = True,
     progress: bool = True,
 ) -> pd.DataFrame:
-    """Evaluate many films in many ways, and say what the monitor would see in each frame.
+    """Evaluate many films in many ways, and list the fractions that the monitor would see in each frame.
 
-    A sweep that was stopped goes on, when called again, at the film it was at.
+    A sweep that was interrupted continues, when it is called again, with the film that it was evaluating.
 
     Parameters
     ----------
@@ -353,9 +335,9 @@ def sweep(
 
 
 def watch(times_s: ArrayLike, tau_s: ArrayLike, phase_s: float = 0.0) -> pd.DataFrame:
-    """Which frames a monitor evaluates: the newest when it is free, then busy, then the newest again.
+    """List the frames that a monitor evaluates: whenever it is free, it takes the newest frame.
 
-    If there is no newer frame than the last it had, it waits for one. It stops where the film does.
+    If there is no newer frame than the last that it took, it waits for one. It stops at the end of the film.
 
     Parameters
     ----------
@@ -370,7 +352,7 @@ def watch(times_s: ArrayLike, tau_s: ArrayLike, phase_s: float = 0.0) -> pd.Data
     -------
     DataFrame
         `index` into `times_s` and `t_s` of each frame used; `decision_s`, when its evaluation ends;
-        `dropped`, how many frames between it and the one used before nobody saw.
+        `dropped`, the number of frames between it and the one used before.
 
     Raises
     ------
@@ -405,7 +387,7 @@ def watch(times_s: ArrayLike, tau_s: ArrayLike, phase_s: float = 0.0) -> pd.Data
 
 
 def expected_delay(tau_s: ArrayLike, camera_s: float = 0.04, truth_s: float | None = None) -> pd.DataFrame:
-    """Delay that a monitor which measures perfectly has by chance: the grey area of Figure 5.
+    """Return the expected delay of a monitor that measures without error: the grey area of Figure 5.
 
     The true trigger is at a frame of the film, at T. From then on the monitor looks out for the first evaluation
     that starts at or after the first frame it can see, T + A. Switched on at a random moment, it starts one at
@@ -444,19 +426,19 @@ def expected_delay(tau_s: ArrayLike, camera_s: float = 0.04, truth_s: float | No
 def errors(
     table: pd.DataFrame, tau_s: ArrayLike | None = None, *, phases: int = 8, limit_s: float = 1.0
 ) -> pd.DataFrame:
-    """Let the monitor run over evaluated films: how wrong are its trigger times?
+    """Replay the monitor over evaluated films, and compare its trigger times with the true ones.
 
     Parameters
     ----------
     table : DataFrame
         From `sweep`.
     tau_s : float or array, optional
-        Evaluation times to impose. Without it, the table's own column `tau_s`, which can differ from method to
-        method and from frame to frame.
+        Evaluation times to impose. By default those in the table's column `tau_s`, which can differ between
+        methods and between frames.
     phases : int
-        Moments of switching on, evenly over one τ (or the time between frames, if that is longer).
+        Number of moments of switching on, evenly over one τ (or the time between frames, if that is longer).
     limit_s : float
-        A trigger fails that is off by more than this, beyond the clock's own delay.
+        Largest error of a trigger time, beyond the clock's own delay, that does not count as a failure, s.
 
     Returns
     -------
@@ -508,7 +490,7 @@ def errors(
 
 
 def _clock(times: NDArray, tau: float | NDArray, fraction: float) -> tuple:
-    """Mean τ, phase, and the columns of `watch` (frames dropped so far) as lists, but for the index."""
+    """Return mean τ, phase and index (k,) of the frames used at times (n,), and lists (k,) of time, decision, drops."""
     mean = float(np.mean(tau))
     phase = fraction * (max(mean, times[1] - times[0]) if len(times) > 1 else mean)
     used = watch(times, tau, phase)
@@ -517,7 +499,7 @@ def _clock(times: NDArray, tau: float | NDArray, fraction: float) -> tuple:
 
 
 def summary(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """Median and quartiles of trigger errors, never without the number of those that are not in them.
+    """Return median and quartiles of trigger errors, with the numbers of replays that they leave out.
 
     Parameters
     ----------

@@ -17,7 +17,8 @@ from gdptlab.experiment.image_types import IMAGE_TYPES
 from gdptlab.experiment.microscope import Microscope
 
 SIZE = 61
-"""Rows and columns of the sample calibration images, px."""
+"""Rows and columns of the sample calibration images, px: odd, and as large as the widest image in the channel, 58 x 52
+px at z = +50 µm. Smaller templates would cut that image; larger ones would reach into neighbours."""
 
 
 def sample_scan(image_type: str = "fluorescent") -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
@@ -36,8 +37,8 @@ def sample_scan(image_type: str = "fluorescent") -> tuple[NDArray[np.uint16], ND
     """
     choice("image_type", image_type, IMAGE_TYPES)
     microscope, z_um, rng = Microscope(), np.linspace(-50, 50, 51), np.random.default_rng(20250408)
-    places = np.stack(np.meshgrid(*2 * [np.arange(56, 512, 100)]), axis=-1).reshape(-1, 2)
-    x_px, y_px = (rng.permutation(places)[:14] + rng.uniform(-12, 12, (14, 2))).T
+    positions = np.stack(np.meshgrid(*2 * [np.arange(56, 512, 100)]), axis=-1).reshape(-1, 2)
+    x_px, y_px = (rng.permutation(positions)[:14] + rng.uniform(-12, 12, (14, 2))).T
     beads = pd.DataFrame({"x_px": x_px, "y_px": y_px})
     scan = [microscope.render(beads.assign(z_um=z), image_type=image_type, rng=rng) for z in z_um]
     return np.stack(scan), z_um

@@ -9,7 +9,7 @@ from gdptlab.experiment.channel import Channel
 
 
 def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.DataFrame:
-    """Fraction of particles in the middle third of height and width, frame by frame.
+    """Return the fraction of particles in the middle third of height and width, frame by frame.
 
     Parameters
     ----------
@@ -37,32 +37,32 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
     if frames.ndim != 1 or (np.diff(frames) <= 0).any():
         raise ValueError(f"frames: got {frames}, allowed are increasing numbers")
     table = table[table["frame"].isin(frames)]
-    place = np.searchsorted(frames, table["frame"])
-    count = np.bincount(place, minlength=len(frames))
+    row = np.searchsorted(frames, table["frame"])
+    count = np.bincount(row, minlength=len(frames))
     inside = {f"fraction_{of}": in_middle_third(table, of, channel) for of in "hw"}
     empty = np.where(count > 0, 0.0, np.nan)
     fractions = {
-        name: np.bincount(place, weights=yes, minlength=len(frames)) / np.maximum(count, 1) + empty
+        name: np.bincount(row, weights=yes, minlength=len(frames)) / np.maximum(count, 1) + empty
         for name, yes in inside.items()
     }
     return pd.DataFrame({"frame": frames, "count": count} | fractions)
 
 
 def in_middle_third(table: pd.DataFrame, of: str, channel: Channel) -> NDArray[np.bool_]:
-    """Which particles, of a table in channel coordinates, have |z| ≤ h/6 (of 'h') or |y| ≤ w/6 (of 'w')."""
+    """Tell which particles (n,) of a table in channel coordinates have |z| ≤ h/6 (of 'h') or |y| ≤ w/6 (of 'w')."""
     column, size_um = {"h": ("z_um", channel.height_um), "w": ("y_um", channel.width_um)}[of]
     return np.abs(table[column].to_numpy()) <= size_um / 6
 
 
 def trigger_time(times_s: ArrayLike, fraction: ArrayLike, level: float = 0.9) -> float:
-    """First time at which `fraction` is at or above `level`; NaN if it never is.
+    """Return the first time at which `fraction` is at or above `level`; NaN if it never is.
 
     Parameters
     ----------
     times_s, fraction : arrays (n,)
         NaN fractions do not trigger.
     level : float
-        In (0, 1] (paper: 0.9).
+        Fraction that triggers, in (0, 1] (paper: 0.9).
     """
     hits = np.flatnonzero(np.asarray(fraction) >= _level(level))
     return float(np.asarray(times_s)[hits[0]]) if len(hits) else np.nan

@@ -1,4 +1,4 @@
-"""The model of a frame, fitted: all particles and the background at once."""
+"""The model of a frame, fitted: a smooth background plus a sum of particles, all at once."""
 
 import lazy_loader
 
@@ -6,8 +6,12 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "field_calibration": ["FieldCalibration"],
-        "over_field": ["decided_by_plane", "locate_over_field"],
-        "field_images": ["field_terms"],
+        "bounds": ["expected_error", "own_bias_um", "own_error"],
+        "frames": ["explained"],
+        "joint": ["Explained", "Joint"],
+        "learning": ["learned"],
+        "model": ["PatternModel", "field_terms"],
+        "pattern": ["particle_light"],
+        "plane": ["decided_by_plane"],
     },
 )

@@ -1,5 +1,6 @@
 """A smooth background: the light of a frame that belongs to no particle."""
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
@@ -9,6 +10,10 @@ from gdptlab.fit.renderer import Columns
 
 BOUNDED = 3.0
 """Residuals beyond so many standard deviations pull no harder than these: light not yet explained is no background."""
+
+PRINT = False
+FINER = 5.0
+"""Factor by which finer knots must lower the smoothed residual to be taken."""
 
 EVERY = 3
 """Rows that are summed for the products of particles and background, both smooth over so many."""
@@ -101,6 +106,23 @@ def _products(boxes, starts, values, weight, down, across, out):  # pragma: no c
                         total += seen[q] * spline[q]
                     for a in range(len(down)):
                         out[4 * i + c, a, b] += down[a, r] * total
+
+
+def suitable(
+    surfaces: list[Background], residual: NDArray[np.float32], weight: NDArray[np.float32], smooth_px: float
+) -> int:
+    """Index of the coarsest of several surfaces, from coarse to fine, that leaves hardly more than the finest.
+
+    Compared is the median size of what is left (rows, columns), smoothed over `smooth_px`: noise is little there, and
+    particles that are not found yet are on few pixels.
+    """
+    left = []
+    for surface in surfaces:
+        smooth = cv2.GaussianBlur(residual - surface.fit(residual, weight), (0, 0), smooth_px)
+        left.append(np.median(np.abs(smooth[weight > 0])))
+    if PRINT:
+        print("      surfaces", np.array(left) / left[-1])
+    return int(np.argmax(np.array(left) <= FINER * left[-1]))
 
 
 def _splines(n: int, spans: int) -> NDArray[np.float32]:

@@ -1,9 +1,11 @@
-"""Images of a particle anywhere in x, y and z, with their derivatives: what overlapping images are fitted with.
+"""The renderer: particles drawn into a frame, with derivatives, from patterns at known depths.
 
-The images of a calibration become the coefficients of a cubic spline in z, y and x. From it the image of a
-particle at any place is drawn pixel by pixel, and so are the four images that say how it changes with y, x, z
-and brightness: the columns of the least-squares problem. The kernels are compiled (numba), as they touch each
-pixel of each particle in each step of the fit.
+Patterns become the coefficients of a cubic spline in z, y and x. From it the image of a particle anywhere is drawn
+pixel by pixel, and so are the images that say how it changes with y, x, z, amplitude and modes: the columns of the
+least-squares problem. Kernels are compiled (numba), as they touch each pixel of each particle in each step of the fit.
+
+The nodes of a row are stored by phase, every `fine`-th beside each other, so that the four nodes which a pixel
+needs, and those of the next pixel, are neighbours in memory whatever the number of nodes per pixel.
 """
 
 from dataclasses import dataclass
@@ -13,17 +15,26 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter, spline_filter1d
 
 from gdptlab._compiled import compiled, inlined
+from gdptlab.fit.model import field_terms
+from gdptlab.fit.threads import in_parts
 
 FAINT = 0.35
-"""A particle's image ends where it stays, once smoothed, below this share of the noise of a pixel."""
+"""Fraction of a pixel's noise: a particle's image, smoothed over 2 px, ends where it stays below. Of a stack with
+noise the mean over 2 px has 0.14 of a pixel's, so that noise alone is hardly ever drawn as part of an image."""
 
-RIM = 2
-"""Nodes of the spline around the images, for its four-point support."""
+UNSURE = 1.5
+"""Standard deviations of a pattern's error: an image also ends where it stays below so many."""
+
+LEVELS = 14
+"""Number of amplitudes, each twice the one before, for which the support is tabulated."""
+
+RIM = 4
+"""Nodes of the spline around the patterns, for its four-point support about a particle between two pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Particles drawn into a frame: for each the pixels it reaches, its image and that image's derivatives.
+    """Particles drawn into a frame: for each the pixels of its support, its image and that image's derivatives.
 
     Attributes
     ----------
@@ -31,17 +42,23 @@ class Columns:
         First row, end of the rows, first column and end of the columns of each particle, cut at the frame.
     starts : int array (P + 1,)
         Where its pixels, row by row, begin in `values`.
-    values : float32 array (4, pixels)
-        Derivatives by y, x, step along the stack, and brightness; the last is the image at brightness 1.
+    values : float32 array (4 or 4 + K, pixels)
+        Derivatives by y, x, slice and amplitude, then by each mode; [3] is the image at amplitude 1.
+    threads : int
     """
 
     boxes: NDArray[np.int64]
     starts: NDArray[np.int64]
     values: NDArray[np.float32]
+    threads: int = 1
 
-    def add_to(self, frame: NDArray[np.float32], brightness: NDArray[np.float64]) -> None:
-        """Add all images, each times its `brightness` (P,), to `frame`."""
-        _add(frame, brightness, self.boxes, self.starts, self.values)
+    def add_to(self, frame: NDArray[np.float32], amplitude: NDArray[np.float64]) -> None:
+        """Add all images, each times its `amplitude` (P,), to `frame`."""
+
+        def kernel(top: int, bottom: int) -> None:
+            _add(frame, amplitude, top, bottom, self.boxes, self.starts, self.values)
+
+        in_parts(self.threads, np.ones(len(frame)), kernel)
 
     def gradient(
         self, residual: NDArray[np.float32], weight: NDArray[np.float32]
@@ -51,17 +68,21 @@ class Columns:
         Parameters
         ----------
         residual, weight : float32 arrays (rows, columns)
-            What the particles leave of the frame, and one over the variance of each pixel.
+            What the model leaves of the frame, and one over the variance of each pixel.
 
         Returns
         -------
         gradient : float64 array (P, 4)
-            Products of the columns with the residual.
+            Products of the first four columns with the residual.
         chi2 : float64 array (P,)
-            Squares of the residual in each box. Both are weighted.
+            Squares of the residual on each support. Both are weighted.
         """
         sums = np.zeros((len(self.boxes), 5))
-        _gradient(residual, weight, self.boxes, self.starts, self.values, sums)
+
+        def kernel(first: int, end: int) -> None:
+            _gradient(residual, weight, first, end, self.boxes, self.starts, self.values, sums)
+
+        in_parts(self.threads, np.diff(self.starts), kernel)
         return sums[:, :4], sums[:, 4]
 
     def matrix(self, weight: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -72,64 +93,123 @@ class Columns:
         count = len(self.boxes)
         # The last particle that can overlap with particle i; boxes are sorted by x only roughly.
         nearest_start = np.minimum.accumulate(self.boxes[::-1, 2])[::-1]
-        reach = np.searchsorted(nearest_start, self.boxes[:, 3]) - 1 - np.arange(count)
-        band = np.zeros((4 * max(int(reach.max(initial=0)), 0) + 4, 4 * count))
-        _matrix(weight, self.boxes, self.starts, self.values, band)
+        last = np.searchsorted(nearest_start, self.boxes[:, 3]) - 1 - np.arange(count)
+        band = np.zeros((4 * max(int(last.max(initial=0)), 0) + 4, 4 * count))
+
+        def kernel(first: int, end: int) -> None:
+            _matrix(weight, first, end, self.boxes, self.starts, self.values, band)
+
+        in_parts(self.threads, np.diff(self.starts), kernel)
         return band
 
 
-class ParticleImages:
-    """Image of a particle at any place, from images at known depths.
+class Renderer:
+    """Draws particles from patterns.
 
     Parameters
     ----------
-    images : array (N, n, n)
-        A particle of brightness 1 in the middle of each, on no background; n is odd.
+    patterns : array (M, N, m, m)
+        As in `PatternModel`.
+    nodes_per_px : int
+    surface : array (4,), optional
+        Focal surface.
+    modes : array (K, N, m, m), optional
     noise : float
-        Standard deviation of a pixel's noise, which decides how far an image reaches.
+        Standard deviation of a pixel, which decides with the amplitude how far an image reaches.
+    error : array (N, m, m), optional
+        Standard deviation of the patterns' error, as in `PatternModel`, for the same.
+    threads : int
     """
 
-    def __init__(self, images: NDArray, noise: float) -> None:
-        self.count, self.size, _ = images.shape
-        nodes = np.pad(images.astype(np.float64), ((0, 0), (RIM, RIM), (RIM, RIM)))
-        for axis in (1, 2):
-            nodes = spline_filter1d(nodes, axis=axis)
-        self._nodes = along_z(nodes.reshape(len(nodes), -1)).astype(np.float32)
-        self.reach = _reach(images, noise)
+    def __init__(
+        self,
+        patterns: NDArray,
+        nodes_per_px: int,
+        *,
+        noise: float,
+        surface: NDArray | None = None,
+        modes: NDArray | None = None,
+        error: NDArray | None = None,
+        threads: int = 1,
+    ) -> None:
+        self.terms, self.count, m, _ = patterns.shape
+        self.fine, self.half, self.threads = nodes_per_px, m // (2 * nodes_per_px), threads
+        self.surface = np.zeros(4) if surface is None else surface
+        self.modes = 0 if modes is None else len(modes)
+        differ = np.flatnonzero(np.any(modes, axis=(0, 2, 3))) if self.modes else []
+        self._differ = (differ[0] - 2, differ[-1] + 1) if len(differ) else (0, -1)
+        self._nodes = _nodes(patterns if modes is None else np.concatenate([patterns, modes]), nodes_per_px)
+        self.support = _support(patterns, nodes_per_px, noise, error)
 
-    def boxes(self, places: NDArray, shape: tuple[int, int]) -> NDArray[np.int64]:
-        """Pixels that particles reach in a frame of `shape`, (P, 4) as in `Columns`.
-
-        Parameters
-        ----------
-        places : array (P, 4)
-            y, x (px), step along the stack, brightness.
-        shape : (rows, columns)
-        """
-        nearest = np.clip(np.rint(places[:, 2]).astype(int), 0, self.count - 1)
-        reach = self.reach[nearest]
+    def boxes(self, places: NDArray, slices: NDArray, shape: tuple[int, int]) -> NDArray[np.int64]:
+        """Pixels (P, 4) of the particles' supports, as in `Columns`, at `places` and `slices` of the stack (P,)."""
+        level = np.ceil(np.log2(np.maximum(places[:, 3], 1))).astype(int)
+        nearest = np.clip(np.rint(slices).astype(int), 0, self.count - 1)
+        support = self.support[np.minimum(level, LEVELS - 1), nearest]
         middle = np.rint(places[:, :2]).astype(int)
         ends = [
-            np.clip(middle[:, i] + sign * reach[:, i] + (sign > 0), 0, shape[i]) for i in (0, 1) for sign in (-1, 1)
+            np.clip(middle[:, i] + sign * support[:, i] + (sign > 0), 0, shape[i]) for i in (0, 1) for sign in (-1, 1)
         ]
         return np.stack(ends, axis=1)
 
-    def draw(self, places: NDArray[np.float64], shape: tuple[int, int]) -> Columns:
+    def draw(
+        self,
+        places: NDArray[np.float64],
+        shape: tuple[int, int],
+        heights: NDArray[np.float64] | None = None,
+        *,
+        by_mode: bool = False,
+    ) -> Columns:
         """Draw particles, with derivatives.
 
         Parameters
         ----------
-        places : float64 array (P, 4)
-            y, x (px), step along the stack, brightness.
+        places : float64 array (P, 4 + K)
+            y, x (px), slice, amplitude, and the particle's coefficient of each mode; without them (P, 4), 0.
         shape : (rows, columns)
             Of the frame; particles may be cut by its edges or lie outside.
+        heights : float64 array (P,), optional
+            Slices at which the particles are in focus, if not those of the focal surface.
+        by_mode : bool
+            Append to the columns the derivative by each mode.
         """
-        boxes = self.boxes(places, shape)
+        terms = field_terms(places[:, 1], places[:, 0], shape)
+        slices = places[:, 2] - (terms @ self.surface if heights is None else heights)
+        slices = np.clip(slices, -1.0, float(self.count))
+        boxes = self.boxes(places, slices, shape)
         area = np.maximum(boxes[:, 1] - boxes[:, 0], 0) * np.maximum(boxes[:, 3] - boxes[:, 2], 0)
         starts = np.concatenate([[0], np.cumsum(area)])
-        values = np.empty((4, starts[-1]), dtype=np.float32)
-        _draw(self._nodes, self.size + 2 * RIM, places, boxes, starts, values)
-        return Columns(boxes, starts, values)
+        values = np.empty((4 + by_mode * self.modes, starts[-1]), dtype=np.float32)
+        factors = np.zeros((len(places), len(self._nodes)), np.float32)
+        factors[:, : self.terms] = terms[:, : self.terms]
+        factors[:, self.terms : self.terms + places.shape[1] - 4] = places[:, 4 : 4 + self.modes]
+        size = 2 * self.half + 1
+
+        def kernel(first: int, end: int) -> None:
+            scratch = np.zeros((5, self.fine, self.fine, (size + RIM) * (size + RIM)), np.float32)
+            _draw(
+                self._nodes, factors, self.terms, self._differ, places, slices, first, end,
+                boxes, starts, values, scratch,
+            )  # fmt: skip
+
+        in_parts(self.threads, area, kernel)
+        return Columns(boxes, starts, values, self.threads)
+
+    def image(self, places: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
+        """Model image (rows, columns) of all particles at `places` (P, 4 + K)."""
+        frame = np.zeros(shape, np.float32)
+        self.draw(places, shape).add_to(frame, places[:, 3])
+        return frame
+
+
+def _nodes(patterns: NDArray, fine: int) -> NDArray[np.float32]:
+    """Spline coefficients (T, N + 2, m + 2 RIM, fine, columns) of patterns (T, N, m, m), columns by phase."""
+    nodes = np.pad(patterns.astype(np.float64), ((0, 0), (0, 0), (RIM, RIM), (RIM, RIM)))
+    for axis in (2, 3):
+        nodes = spline_filter1d(nodes, axis=axis)
+    nodes = np.moveaxis(along_z(np.moveaxis(nodes, 1, 0)), 0, 1).astype(np.float32)
+    nodes = np.pad(nodes, ((0, 0), (0, 0), (0, 0), (0, -nodes.shape[-1] % fine)))
+    return np.ascontiguousarray(np.moveaxis(nodes.reshape(*nodes.shape[:-1], -1, fine), -1, -2))
 
 
 def along_z(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -148,17 +228,23 @@ def along_z(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.einsum("kn,n...->k...", np.linalg.inv(matrix), np.concatenate([ends, values, ends]), optimize=True)
 
 
-def _reach(images: NDArray, noise: float) -> NDArray[np.int64]:
-    """Rows and columns (N, 2) from the middle to where each image ends."""
-    half = images.shape[1] // 2
-    visible = np.abs(gaussian_filter(images, (0, 2, 2))) > FAINT * noise
-    away = np.abs(np.arange(images.shape[1]) - half)
-    reach = [np.where(visible.any(axis=other), away, 3).max(axis=1) for other in (2, 1)]
-    return np.minimum(median_filter(np.stack(reach, axis=1), (5, 1), mode="nearest") + 1, half)
+def _support(patterns: NDArray, fine: int, noise: float, error: NDArray | None) -> NDArray[np.int64]:
+    """Rows and columns (LEVELS, N, 2) from the middle to where images of amplitude 1, 2, 4, ... end."""
+    images = patterns[..., ::fine, ::fine]
+    half = images.shape[-1] // 2
+    light = np.abs(gaussian_filter(images, (0, 0, 2, 2))).sum(axis=0)
+    # Smoothed over 2 px, as the light, the error is far less.
+    unsure = 0 if error is None else UNSURE * error[:, ::fine, ::fine] / (2 * np.sqrt(np.pi) * 2)
+    away, support = np.abs(np.arange(-half, half + 1)), np.empty((LEVELS, images.shape[1], 2), int)
+    for level in range(LEVELS):
+        visible = light > np.maximum(FAINT * noise / 2**level, unsure)
+        ends = [np.where(visible.any(axis=other), away, 3).max(axis=1) for other in (2, 1)]
+        support[level] = median_filter(np.stack(ends, axis=1), (5, 1), mode="nearest") + 1
+    return np.minimum(support, half)
 
 
 @inlined
-def spline_weights(f):  # pragma: no cover
+def _spline(f):  # pragma: no cover
     """Weights, and their derivatives, of the four nodes around a point at `f` between the middle two."""
     g = 1 - f
     weights = (g * g * g / 6, (3 * f * f * f - 6 * f * f + 4) / 6, (3 * g * g * g - 6 * g * g + 4) / 6, f * f * f / 6)
@@ -170,69 +256,121 @@ def spline_weights(f):  # pragma: no cover
 
 
 @compiled
-def _draw(nodes, width, places, boxes, starts, values):  # pragma: no cover
-    """Fill `values` (4, pixels): along z over the nodes in reach, then x, then y."""
-    half = (width - 2 * RIM) // 2
-    scratch = np.zeros((5, width * width + 3), np.float32)
-    a, b, c, d, e = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
-    for i in range(len(places)):
+def _draw(
+    nodes, factors, terms, differ, places, slices, first, end, boxes, starts, values, scratch
+):  # pragma: no cover
+    """Fill `values` of particles `first` to `end`: along z over the nodes of the support, then x, then y.
+
+    Nodes are handled by phase, and those of one phase of rows and columns as one long line, a row after the other.
+    `scratch` (5, fine, fine, nodes) holds such lines: image, derivative by z, then the same and the derivative by x
+    between the nodes of a row.
+    """
+    _, levels, _, fine, width = nodes.shape
+    middle = nodes.shape[2] // 2
+    for i in range(first, end):
         y0, y1, x0, x1 = boxes[i]
         rows, columns = y1 - y0, x1 - x0
         if rows <= 0 or columns <= 0:
             continue
-        y, x, step, brightness = places[i]
-        k = min(max(int(np.floor(step)), 0), len(nodes) - 4)
-        top, left = y0 - y + half, x0 - x + half
-        row, column = int(np.floor(top)), int(np.floor(left))
-        (z0, z1, z2, z3), (dz0, dz1, dz2, dz3) = spline_weights(step - k)
-        (v0, v1, v2, v3), (dv0, dv1, dv2, dv3) = spline_weights(top - row)
-        (h0, h1, h2, h3), (dh0, dh1, dh2, dh3) = spline_weights(left - column)
-        across = columns + 3
-        for r in range(rows + 3):
-            s, t = (row + 1 + r) * width + column + 1, r * across
-            n0, n1, n2, n3, a0, b0 = nodes[k, s:], nodes[k + 1, s:], nodes[k + 2, s:], nodes[k + 3, s:], a[t:], b[t:]
-            for j in range(across):
-                a0[j] = z0 * n0[j] + z1 * n1[j] + z2 * n2[j] + z3 * n3[j]
-                b0[j] = dz0 * n0[j] + dz1 * n1[j] + dz2 * n2[j] + dz3 * n3[j]
-        length = (rows + 3) * across
-        for j in range(length):
-            c[j] = h0 * a[j] + h1 * a[j + 1] + h2 * a[j + 2] + h3 * a[j + 3]
-            d[j] = dh0 * a[j] + dh1 * a[j + 1] + dh2 * a[j + 2] + dh3 * a[j + 3]
-            e[j] = h0 * b[j] + h1 * b[j + 1] + h2 * b[j + 2] + h3 * b[j + 3]
-        length -= 3 * across
-        c1, c2, c3 = c[across:], c[2 * across :], c[3 * across :]
-        d1, d2, d3 = d[across:], d[2 * across :], d[3 * across :]
-        e1, e2, e3 = e[across:], e[2 * across :], e[3 * across :]
-        for j in range(length):
-            a[j] = v0 * c[j] + v1 * c1[j] + v2 * c2[j] + v3 * c3[j]
-            b[j] = dv0 * c[j] + dv1 * c1[j] + dv2 * c2[j] + dv3 * c3[j]
-        for j in range(length):
-            c[j] = v0 * d[j] + v1 * d1[j] + v2 * d2[j] + v3 * d3[j]
-        for j in range(length):
-            d[j] = v0 * e[j] + v1 * e1[j] + v2 * e2[j] + v3 * e3[j]
-        light = np.float32(brightness)
-        for r in range(rows):
-            s, t = starts[i] + r * columns, r * across
-            j0, j1, j2, j3 = values[0, s:], values[1, s:], values[2, s:], values[3, s:]
-            b0, c0, d0, a0 = b[t:], c[t:], d[t:], a[t:]
-            for q in range(columns):
-                j0[q], j1[q], j2[q], j3[q] = -light * b0[q], -light * c0[q], light * d0[q], a0[q]
+        k = min(max(int(np.floor(slices[i])), 0), levels - 4)
+        z, dz = _spline(slices[i] - k)
+        used = len(nodes) if differ[0] <= k <= differ[1] else terms
+        top, left = fine * (y0 - places[i, 0]) + middle, fine * (x0 - places[i, 1]) + middle
+        row, column = int(np.floor(top)) - 1, int(np.floor(left)) - 1
+        v, dv = _spline(top - row - 1)
+        h, dh = _spline(left - column - 1)
+        begin, offset = column // fine, column % fine
+        across = min(columns + 3, width - begin)
+        for j in range(fine * (rows - 1) + 4):
+            for p in range(fine):
+                s = (j // fine) * across
+                a, b = scratch[0, j % fine, p, s:], scratch[1, j % fine, p, s:]
+                for t in range(used):
+                    four = nodes[t, k : k + 4, row + j, p, begin:]
+                    _mix(four, z, dz, factors[i, t], across, a, b, t == 0)
+        for p in range(fine):
+            length = ((fine * (rows - 1) + 3 - p) // fine + 1) * across
+            _along_x(scratch[0, p], offset, h, length, scratch[2, p, 0])
+            _along_x(scratch[0, p], offset, dh, length, scratch[3, p, 0])
+            _along_x(scratch[1, p], offset, h, length, scratch[4, p, 0])
+        s, light, step = starts[i], np.float32(places[i, 3]), np.float32(-places[i, 3] * fine)
+        _along_y(scratch[2], dv, step, rows, columns, across, scratch[0, 0, 0], values[0, s:])
+        _along_y(scratch[3], v, step, rows, columns, across, scratch[0, 0, 0], values[1, s:])
+        _along_y(scratch[4], v, light, rows, columns, across, scratch[0, 0, 0], values[2, s:])
+        _along_y(scratch[2], v, np.float32(1), rows, columns, across, scratch[0, 0, 0], values[3, s:])
+        for m in range(4, len(values)):
+            if used == terms:
+                values[m, s : starts[i + 1]] = 0
+                continue
+            for j in range(fine * (rows - 1) + 4):
+                for p in range(fine):
+                    q = (j // fine) * across
+                    a, b = scratch[0, j % fine, p, q:], scratch[1, j % fine, p, q:]
+                    four = nodes[terms + m - 4, k : k + 4, row + j, p, begin:]
+                    _mix(four, z, dz, np.float32(1), across, a, b, True)
+            for p in range(fine):
+                length = ((fine * (rows - 1) + 3 - p) // fine + 1) * across
+                _along_x(scratch[0, p], offset, h, length, scratch[2, p, 0])
+            _along_y(scratch[2], v, light, rows, columns, across, scratch[0, 0, 0], values[m, s:])
+
+
+@inlined
+def _mix(nodes, z, dz, factor, count, a, b, begin):  # pragma: no cover
+    """Set (`begin`) or add to `a` and `b` the nodes (4, columns) of four slices, weighted with `z` and with `dz`."""
+    n0, n1, n2, n3 = nodes[0], nodes[1], nodes[2], nodes[3]
+    z0, z1, z2, z3 = factor * z[0], factor * z[1], factor * z[2], factor * z[3]
+    d0, d1, d2, d3 = factor * dz[0], factor * dz[1], factor * dz[2], factor * dz[3]
+    if begin:
+        for j in range(count):
+            a[j] = z0 * n0[j] + z1 * n1[j] + z2 * n2[j] + z3 * n3[j]
+            b[j] = d0 * n0[j] + d1 * n1[j] + d2 * n2[j] + d3 * n3[j]
+    else:
+        for j in range(count):
+            a[j] += z0 * n0[j] + z1 * n1[j] + z2 * n2[j] + z3 * n3[j]
+            b[j] += d0 * n0[j] + d1 * n1[j] + d2 * n2[j] + d3 * n3[j]
+
+
+@inlined
+def _along_x(lines, offset, h, count, out):  # pragma: no cover
+    """Fill `out` (count): four nodes, of lines (fine, nodes) by phase, for each pixel, the first at `offset`."""
+    fine = len(lines)
+    a0, a1 = lines[offset % fine, offset // fine :], lines[(offset + 1) % fine, (offset + 1) // fine :]
+    a2, a3 = lines[(offset + 2) % fine, (offset + 2) // fine :], lines[(offset + 3) % fine, (offset + 3) // fine :]
+    h0, h1, h2, h3 = h
+    for q in range(count):
+        out[q] = h0 * a0[q] + h1 * a1[q] + h2 * a2[q] + h3 * a3[q]
+
+
+@inlined
+def _along_y(lines, v, factor, rows, columns, across, line, image):  # pragma: no cover
+    """Fill `image` (rows * columns): four rows, of lines (fine, 1, pixels) by phase, for each pixel, times `factor`."""
+    fine = len(lines)
+    c0, c1 = lines[0, 0], lines[1 % fine, 0, (1 // fine) * across :]
+    c2, c3 = lines[2 % fine, 0, (2 // fine) * across :], lines[3 % fine, 0, (3 // fine) * across :]
+    v0, v1, v2, v3 = factor * v[0], factor * v[1], factor * v[2], factor * v[3]
+    for q in range(rows * across):
+        line[q] = v0 * c0[q] + v1 * c1[q] + v2 * c2[q] + v3 * c3[q]
+    for r in range(rows):
+        row, out = line[r * across :], image[r * columns :]
+        for q in range(columns):
+            out[q] = row[q]
 
 
 @compiled
-def _add(frame, brightness, boxes, starts, values):  # pragma: no cover
+def _add(frame, amplitude, top, bottom, boxes, starts, values):  # pragma: no cover
+    """Add to the rows `top` to `bottom` of the frame."""
     for i in range(len(boxes)):
         y0, y1, x0, x1 = boxes[i]
-        light = np.float32(brightness[i])
-        for r in range(y0, y1):
+        light = np.float32(amplitude[i])
+        for r in range(max(y0, top), min(y1, bottom)):
             row, image = frame[r, x0:x1], values[3, starts[i] + (r - y0) * (x1 - x0) :]
             for q in range(len(row)):  # from 0: an index that cannot be negative is far faster
                 row[q] += light * image[q]
 
 
 @compiled
-def _gradient(residual, weight, boxes, starts, values, sums):  # pragma: no cover
-    for i in range(len(boxes)):
+def _gradient(residual, weight, first, end, boxes, starts, values, sums):  # pragma: no cover
+    for i in range(first, end):
         y0, y1, x0, x1 = boxes[i]
         for r in range(y0, y1):
             s = starts[i] + (r - y0) * (x1 - x0)
@@ -255,14 +393,14 @@ def _gradient(residual, weight, boxes, starts, values, sums):  # pragma: no cove
 
 
 @compiled
-def _matrix(weight, boxes, starts, values, band):  # pragma: no cover
+def _matrix(weight, begin, end, boxes, starts, values, band):  # pragma: no cover
     j0, j1, j2, j3 = values[0], values[1], values[2], values[3]
     largest = 0
-    for i in range(len(boxes)):
+    for i in range(begin, end):
         largest = max(largest, starts[i + 1] - starts[i])
     trusted = np.empty(largest, np.float32)
     zero = np.float32(0)
-    for i in range(len(boxes)):
+    for i in range(begin, end):
         y0, y1, x0, x1 = boxes[i]
         first, area, columns = starts[i], starts[i + 1] - starts[i], x1 - x0
         if area <= 0:
@@ -332,3 +470,71 @@ def _matrix(weight, boxes, starts, values, band):  # pragma: no cover
             band[d - 1, c1], band[d, c1], band[d + 1, c1], band[d + 2, c1] = s10, s11, s12, s13
             band[d - 2, c2], band[d - 1, c2], band[d, c2], band[d + 1, c2] = s20, s21, s22, s23
             band[d - 3, c3], band[d - 2, c3], band[d - 1, c3], band[d, c3] = s30, s31, s32, s33
+
+
+def draw_error(
+    error: NDArray[np.float32],
+    step: int,
+    places: NDArray[np.float64],
+    boxes: NDArray[np.int64],
+    slices: NDArray[np.float64],
+    shape: tuple[int, int],
+) -> NDArray[np.float32]:
+    """Variance (rows, columns) of the patterns' error, from its standard deviation (N, m, m), `step` nodes a pixel."""
+    out = np.zeros(shape, np.float32)
+    nearest = np.clip(np.rint(slices).astype(int), 0, len(error) - 1)
+    _add_error(error, step, places, boxes, nearest, out)
+    return out
+
+
+@compiled
+def _add_error(error, step, places, boxes, nearest, out):  # pragma: no cover
+    half = error.shape[1] // 2
+    for i in range(len(boxes)):
+        y0, y1, x0, x1 = boxes[i]
+        row, column = half - int(np.rint(step * places[i, 0])), half - int(np.rint(step * places[i, 1]))
+        light = np.float32(places[i, 3] ** 2)
+        for r in range(y0, y1):
+            j = min(max(row + step * r, 0), 2 * half)
+            for c in range(x0, x1):
+                k = min(max(column + step * c, 0), 2 * half)
+                std = error[nearest[i], j, k]
+                out[r, c] += light * std * std
+
+
+def energy_beside_errors(
+    columns: Columns,
+    error: NDArray[np.float32],
+    step: int,
+    places: NDArray[np.float64],
+    slices: NDArray[np.float64],
+    weight: NDArray[np.float32],
+    total: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Weighted squares of each particle's pattern, (P,), where the errors of the others' patterns add to the variance.
+
+    `total` is the variance of all errors (rows, columns), from `draw_error`.
+    """
+    out = np.zeros(len(places))
+    nearest = np.clip(np.rint(slices).astype(int), 0, len(error) - 1)
+    _energy(columns.boxes, columns.starts, columns.values[3], error, step, places, nearest, weight, total, out)
+    return out
+
+
+@compiled
+def _energy(boxes, starts, images, error, step, places, nearest, weight, total, out):  # pragma: no cover
+    half = error.shape[1] // 2
+    for i in range(len(boxes)):
+        y0, y1, x0, x1 = boxes[i]
+        row, column = half - int(np.rint(step * places[i, 0])), half - int(np.rint(step * places[i, 1]))
+        light = np.float32(places[i, 3] ** 2)
+        sum_ = 0.0
+        for r in range(y0, y1):
+            j = min(max(row + step * r, 0), 2 * half)
+            s = starts[i] + (r - y0) * (x1 - x0) - x0
+            for c in range(x0, x1):
+                k = min(max(column + step * c, 0), 2 * half)
+                std, trust, image = error[nearest[i], j, k], weight[r, c], images[s + c]
+                others = max(total[r, c] - light * std * std, np.float32(0))
+                sum_ += image * image * trust / (1 + trust * others)
+        out[i] = sum_

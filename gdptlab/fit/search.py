@@ -1,350 +1,237 @@
-"""Particles that overlap, found one after the other and fitted all at once.
+"""The search: where a further particle would explain most of a residual, by a matched filter for all depths at once.
 
-A frame is taken for a smooth background and the sum of the images of particles, each at its place and depth,
-all of nearly the same brightness; the images come from the calibration. Particles are found, some at a time, by a
-matched filter in what the others leave, and after each time all are fitted together. While much is
-unexplained, frame and images are high-pass filtered: neighbours not found yet are smooth there, and do not
-pull. A particle stays while it explains at least half of what it would explain alone.
-
-In a film the particles of one frame, moved on, are where the next begins.
+What hides a particle in a crowd is not the camera's noise but the light of its neighbours, which is strong and
+smooth. The filter therefore takes all that is left of the frame for noise with the spectrum that it has
+(D. O. North's matched filter for coloured noise): where neighbours abound, edges and rings speak; once they
+are explained, all of an image does.
 """
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
-from scipy.optimize import nnls
+from scipy.ndimage import gaussian_filter
 
 from gdptlab._compiled import compiled
-from gdptlab.calibration import Calibration
-from gdptlab.denoising import noise_level
-from gdptlab.fit.background import Background
-from gdptlab.fit.joint_fit import JointFit, fitted
-from gdptlab.fit.matched_filter import MatchedFilter
-from gdptlab.fit.renderer import ParticleImages
+from gdptlab.correlation import good_shape, times_conjugate
+from gdptlab.fit.solver import Population
+
+DEPTHS = 13
+"""About as many depths are searched; the fit finds those between."""
+
+RANK = 10
+"""Singular images that stand for all depths."""
+
+SMOOTHING = 4.0
+"""Standard deviation, in frequency steps, over which the power of the residual's spectrum is smoothed."""
 
 LEAST_GAIN = 20.0
-"""In log-likelihood, of a particle: chi-square of 40 with 4 degrees of freedom, which noise reaches at one place
+"""Log-likelihood that a particle must add: chi-square of 40 with 4 degrees of freedom, which noise reaches at one place
 in ten million, and a frame has some ten thousand places to be at."""
 
+WIDE = 0.5
+"""Standard deviation of the logarithm of amplitudes from which on the search takes them for free."""
+
+LEAST_SPREAD = 0.05
+"""Least relative standard deviation of amplitudes in the search, which looks at whole pixels and few depths."""
+
 SHARE = 0.1
-"""Of the gain of a lone particle, that a new one must bring."""
+"""Fraction of the gain of a lone particle that a further one must bring, where amplitudes are known."""
 
-EXPLAINS = 0.5
-"""Share of what it would explain alone that a particle must explain beside the others."""
-
-LOST = 0.2
-"""Share of a frame's particles that may be gone in the next (or two of them); if more are, the search begins anew."""
-
-KNOWN = 0.02
-"""Spread of brightness, its share, while particles are searched for: as if it were known."""
+SIDE_LOBE = 3.0
+"""A peak may be a side-lobe of one within half a template whose gain is so many times its own: it waits."""
 
 
-@dataclass(frozen=True)
-class Stage:
-    """Of the search.
-
-    Attributes
-    ----------
-    blur : float
-        What is subtracted from frame and images, each blurred over so many widths of a template; 0: nothing.
-    whiten : bool
-        Take all that is unexplained for noise (see `MatchedFilter`).
-    rounds : int
-        At most.
-    """
-
-    blur: float
-    whiten: bool
-    rounds: int
-
-
-STAGES = (
-    Stage(blur=1 / 20, whiten=True, rounds=4),
-    Stage(blur=0, whiten=False, rounds=3),
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """A frame explained, and all that the next one begins with.
-
-    Attributes
-    ----------
-    fit : JointFit
-    stays : bool array
-        Which of the fit's particles are believed.
-    places : float64 array (P, 4)
-        Of those, and of others that may be there: y, x (px), step along the stack, brightness.
-    velocity : float64 array (P, 3)
-        Of y, x and step, per frame.
-    brightness, spread : float
-        Mean and standard deviation of the particles'.
-    variance : float64 array (2,)
-        Slope and level of a pixel's variance in the light of the particles.
-    """
-
-    fit: JointFit
-    stays: NDArray[np.bool_]
-    places: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    brightness: float
-    spread: float
-    variance: NDArray[np.float64]
-
-
-class Overlap:
-    """Plan for frames of one shape, in one thread at a time.
+class MatchedFilter:
+    """Plan for searching frames of one shape, in one thread at a time: it keeps its working memory.
 
     Parameters
     ----------
-    calibration : Calibration
+    images : array (N, n, n)
+        A particle of amplitude 1 at N depths, on no background; n is odd.
     shape : (rows, columns)
+        Of the frames.
     """
 
-    def __init__(self, calibration: Calibration, shape: tuple[int, int]) -> None:
-        images, noise = _continued(calibration.images), noise_level(calibration.stack)
-        self._size, self._scale = calibration.size, 2 if calibration.half_resolution else 1
-        self._shapes, self._surface = ParticleImages(images, noise), Background(shape, 2 * self._size)
-        searched, small = calibration.at_search_resolution(images), tuple(-(-n // self._scale) for n in shape)
-        self._filter = MatchedFilter(searched, small)
-        self._small_surface = Background(small, 2 * self._size / self._scale)
-        self._blurs = [stage.blur * self._size / self._scale for stage in STAGES]
-        self._small_shapes = [ParticleImages(_high_passed(searched, blur), noise) for blur in self._blurs]
+    def __init__(self, images: NDArray, shape: tuple[int, int]) -> None:
+        self._shape, self._steps = shape, np.arange(0, len(images), max(len(images) // DEPTHS, 1))
+        images = images[self._steps].astype(np.float32)
+        n = images.shape[-1]
+        self._half = n // 2
+        self._padded = good_shape(side + n for side in shape)
+        left, values, right = np.linalg.svd(images.reshape(len(images), -1), full_matrices=False)
+        self._mix = np.ascontiguousarray(left[:, :RANK] * values[:RANK], dtype=np.float32)
+        singular = right[:RANK].reshape(-1, n, n).astype(np.float32)
+        rows, columns = (side - n for side in self._padded)
+        self._spectra = [cv2.dft(cv2.copyMakeBorder(b, 0, rows, 0, columns, cv2.BORDER_CONSTANT)) for b in singular]
+        images = (self._mix @ right[:RANK]).reshape(images.shape)
+        self._energy = np.pad((images**2).cumsum(axis=1).cumsum(axis=2), ((0, 0), (1, 0), (1, 0)))
+        spectra = np.fft.rfft2(images, self._padded)
+        twice = np.r_[1, np.full(spectra.shape[-1] - 2, 2), 1]  # half of the spectrum is its mirror image
+        power = np.abs(spectra) ** 2 * (twice / np.prod(self._padded))
+        self._power = power.reshape(len(power), -1).astype(np.float32)
+        self._maps = np.empty((len(self._spectra), *self._padded), dtype=np.float32)
+        self._product = np.empty(self._padded, dtype=np.float32)
 
-    def first(self, frame: NDArray[np.float32]) -> Explained:
-        """Explain a frame (rows, columns) of which nothing is known."""
-        noise = max(noise_level(frame), 1e-4 * float(np.ptp(frame)))
-        noise = noise if noise > 1e-15 else 1.0  # a blank frame has none, or one whose square is lost in float32
-        places, brightness = self._search(self._reduced(frame), noise)
-        places[:, :2] *= self._scale
-        spread, variance, behind = KNOWN * brightness, np.array([0, noise**2]), None
-        weight = np.full(frame.shape, noise**-2, dtype=np.float32)
-        for again in (True, False):
-            fit = self._fitted(frame, places, weight, brightness, spread, behind, 2)
-            places, behind = fit.places[self._stays(fit, brightness)], fit.behind
-            brightness, spread = _brightness(places, brightness, spread)
-            variance = _variance(fit.light, fit.residual, noise)
-            new = self._unexplained(fit, noise, brightness) if again else []
-            if not len(new):
-                break
-            places = np.concatenate([places, new])
-        fit = self._fitted(frame, places, _weight(fit.light, variance), brightness, spread, behind, 3, near=True)
-        stays = self._stays(fit, brightness)
-        return Explained(fit, stays, fit.places[stays], np.zeros((stays.sum(), 3)), brightness, spread, variance)
-
-    def following(self, frame: NDArray[np.float32], before: Explained) -> Explained:
-        """Explain the frame after one that is explained. A particle that appears in it is in the table of the next."""
-        start, velocity = before.places, before.velocity
-        places = start + np.pad(velocity, ((0, 0), (0, 1)))
-        weight = _weight(before.fit.light, before.variance)
-        fit = self._fitted(frame, places, weight, before.brightness, before.spread, before.fit.behind, 2, near=True)
-        stays = self._stays(fit, before.brightness)
-        gone = before.stays.sum() - stays.sum()
-        if gone > max(LOST * before.stays.sum(), 2) or not stays.any():
-            return self.first(frame)
-        places = fit.places[stays]
-        moved = (velocity[stays] + places[:, :3] - start[stays, :3]) / 2
-        brightness, spread = _brightness(places, before.brightness, before.spread)
-        noise = float(np.sqrt(before.variance[-1]))
-        new = self._unexplained(fit, noise, brightness)
-        return Explained(
-            fit,
-            stays,
-            np.concatenate([places, new]),
-            np.concatenate([moved, np.zeros((len(new), 3))]),
-            brightness,
-            spread,
-            _variance(fit.light, fit.residual, noise),
-        )
-
-    def _fitted(
+    def __call__(
         self,
-        frame: NDArray[np.float32],
-        places: NDArray[np.float64],
-        weight: NDArray[np.float32],
-        brightness: float,
-        spread: float,
-        behind: NDArray[np.float32] | None,
-        steps: int,
-        near: bool = False,
-    ) -> JointFit:
-        """All particles and the background at full resolution."""
-        return fitted(
-            self._shapes,
-            frame,
-            places,
-            weight,
-            brightness=brightness,
-            spread=spread,
-            steps=steps,
-            surface=self._surface,
-            behind=behind,
-            near=near,
-        )
-
-    @staticmethod
-    def _stays(fit: JointFit, brightness: float) -> NDArray[np.bool_]:
-        return (fit.explains > EXPLAINS) & (fit.places[:, 3] > brightness / 2)
-
-    def _unexplained(self, fit: JointFit, noise: float, brightness: float) -> NDArray[np.float64]:
-        """Places of further particles, at full resolution; some may lie outside the frame."""
-        small = self._reduced(fit.residual)
-        new = self._new(small, noise, brightness, whiten=False, outside_px=self._size / 4)
-        return new * (self._scale, self._scale, 1, 1)
-
-    def _reduced(self, frame: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The frame at the resolution of the search."""
-        return cv2.pyrDown(frame) if self._scale == 2 else frame
-
-    def _new(
-        self,
-        residual: NDArray,
+        residual: NDArray[np.float32],
         noise: float,
-        brightness: float,
+        population: Population | None,
         *,
         whiten: bool,
-        outside_px: float = 0,
+        size: float,
+        outside_px: float = 0.0,
     ) -> NDArray[np.float64]:
-        """Places of further particles in what others leave, at the resolution of the search."""
-        new, _ = self._filter(
-            residual,
-            noise / self._scale,
-            brightness=brightness,
-            spread=0.05 * brightness,
-            whiten=whiten,
-            least=LEAST_GAIN,
-            share=SHARE,
-            apart_px=self._size / 6 / self._scale,
-            outside_px=outside_px / self._scale,
-        )
-        new[:, 3] = brightness
-        return new
+        """Find the best places for further particles, bright ones first.
 
-    def _search(self, small: NDArray[np.float32], noise: float) -> tuple[NDArray[np.float64], float]:
-        """Places at the resolution of the search, and the particles' brightness."""
-        light, behind = np.zeros_like(small), np.median(small)
-        new, brightness = self._first_look(small - behind, noise)
-        weight = np.full(small.shape, (noise / self._scale) ** -2, dtype=np.float32)
-        places = np.zeros((0, 4))
-        for stage, blur, shapes in zip(STAGES, self._blurs, self._small_shapes, strict=True):
-            for _ in range(stage.rounds):
-                if not stage.whiten:
-                    behind = self._small_surface.fit(small - light, weight)
-                if new is None:
-                    rest = small - behind - light
-                    new = self._new(rest, noise, brightness, whiten=stage.whiten)
-                found, new = new, None
-                if not len(found):
-                    break
-                fit = fitted(
-                    shapes,
-                    _high_passed((small - behind)[None], blur)[0],
-                    np.concatenate([places, found]),
-                    weight,
-                    brightness=brightness,
-                    spread=KNOWN * brightness,
-                    steps=2,
-                )
-                places = fit.places[fit.explains > EXPLAINS]
-                places[:, 3] = brightness
-                light = np.zeros_like(small)
-                self._small_shapes[-1].draw(places, small.shape).add_to(light, places[:, 3])
-                if len(found) < 0.05 * len(places):
-                    break
-        return places, brightness
+        Parameters
+        ----------
+        residual : float32 array (rows, columns)
+            The frame without background and without the particles found so far.
+        noise : float
+            Standard deviation of a pixel.
+        population : Population, optional
+            What is known of the particles' amplitudes.
+        whiten : bool
+            Take all of the residual for noise, rather than the camera's alone.
+        size : float
+            Rows and columns of a template, px. Of places nearer than a sixth of it only the best is given.
+        outside_px : float
+            How far beyond the frame's edge to look.
 
-    def _first_look(self, small: NDArray[np.float32], noise: float) -> tuple[NDArray[np.float64], float]:
-        """Particles that stand out, and the brightness of those that stand out most."""
-        places, gain = self._filter(
-            small,
-            noise / self._scale,
-            whiten=True,
-            least=LEAST_GAIN,
-            share=0,
-            apart_px=self._size / 6 / self._scale,
-        )
-        if not len(places):
-            return places, 1.0
-        best = np.argsort(-gain)[: -(-len(gain) // 3)]
-        brightness = float(np.median(places[best, 3]))
-        # Where few particles are most of the spectrum, the filter takes them for noise and for faint.
-        weight = np.full(small.shape, (noise / self._scale) ** -2, dtype=np.float32)
-        sharp = _high_passed(small[None], self._blurs[0])[0]
-        fit = fitted(self._small_shapes[0], sharp, places, weight, brightness=brightness, spread=brightness, steps=4)
-        brightness = float(np.median(fit.places[best, 3]))
-        places = fit.places[np.abs(np.log(fit.places[:, 3] / brightness)) < np.log(2)]
-        places[:, 3] = brightness
-        return places, brightness
+        Returns
+        -------
+        float64 array (P, 4)
+            y, x (px), slice, amplitude.
+        """
+        if population is None or population.sigma > WIDE:
+            found, gain = self._peaks(residual, noise, 1.0, np.inf, 0.0, whiten, size / 6, outside_px)
+            return found[_in_the_open(found, gain, size / 2)]
+        centre, sigma = population.centre, population.sigma
+        spread = max(sigma, LEAST_SPREAD) * centre
+        found, _ = self._peaks(residual, noise, centre, spread, SHARE, whiten, size / 6, outside_px)
+        found[:, 3] = np.clip(found[:, 3], centre * np.exp(-2 * sigma), centre * np.exp(2 * sigma))
+        return found
 
+    def _peaks(
+        self,
+        residual: NDArray[np.float32],
+        noise: float,
+        centre: float,
+        spread: float,
+        fraction: float,
+        whiten: bool,
+        apart_px: float,
+        outside_px: float,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Peaks (P, 4) of the gain in log-likelihood, best first, and the gain (P,).
 
-def _continued(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Images that go on beyond their frame: the light along each side falls on as a parabola about the middle does."""
-    half = images.shape[1] // 2
-    more, depth = 2 * (half // 3), max(half // 4, 2)
-    away = np.arange(-half - more, half + more + 1)
-    rim, fall = np.abs(away) > half, []
-    for axis in (1, 2):
-        light, factor = images.mean(axis=3 - axis), np.ones((len(images), len(away)), np.float32)
-        for side in (away[more : more + depth], away[-more - depth : -more]):
-            bend, middle = np.polyfit(side**2, light[:, side + half].T, 1)
-            end = np.where(bend * middle < 0, -middle / np.where(bend == 0, 1, bend), 0)
-            end = np.clip(median_filter(end, 5, mode="nearest")[:, None], (half + 1) ** 2, (half + more) ** 2)
-            beyond = rim & (away * side[0] > 0)
-            factor[:, beyond] = np.clip((end - away[beyond] ** 2) / (end - half**2), 0, 1)
-        fall.append(factor)
-    down, across = fall
-    return np.pad(images, ((0, 0), (more, more), (more, more)), mode="edge") * (down[:, :, None] * across[:, None, :])
+        The prior of the amplitude is normal; a peak brings at least `fraction` of what a lone particle would.
+        """
+        (rows, columns), pad = self._shape, self._half
+        canvas = np.zeros(self._padded, dtype=np.float32)
+        # So that index 0 of a map is the centre that lies `pad` outside the frame.
+        canvas[2 * pad : 2 * pad + rows, 2 * pad : 2 * pad + columns] = residual
+        spectrum = cv2.dft(canvas)
+        if whiten:
+            noise_power = np.maximum(smooth_power(spectrum, SMOOTHING) / residual.size, np.float32(noise**2))
+            spectrum /= packed(noise_power)
+            energy = self._power @ (1 / noise_power).ravel()
+        else:
+            spectrum /= np.float32(noise**2)
+            energy = self._energy[:, -1, -1] / noise**2
+        for map_, image in zip(self._maps, self._spectra, strict=True):
+            times_conjugate(spectrum, image, self._product)
+            cv2.idft(self._product, map_, flags=cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
+        cut = self._energy * (energy / self._energy[:, -1, -1])[:, None, None]
+        known = spread**-2
+        gain, bright = (np.zeros((rows + 2 * pad, columns + 2 * pad), np.float32) for _ in range(2))
+        best = np.zeros(gain.shape, np.int32)
+        margin = int(np.clip(round(pad - outside_px), 0, pad))
+        cut = cut.astype(np.float32)
+        _gain(self._maps, self._mix, cut, rows, columns, margin, centre, known, fraction, gain, best, bright)
+
+        width = 2 * max(round(apart_px), 1) + 1
+        near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+        i, j = np.nonzero((gain > LEAST_GAIN) & (gain == cv2.dilate(gain, near)))
+        found = np.stack([i - pad, j - pad, self._steps[best[i, j]], bright[i, j]], axis=1).astype(float)
+        order = np.argsort(-gain[i, j], kind="stable")
+        return found[order], gain[i, j][order]
 
 
-def _high_passed(images: NDArray, blur: float) -> NDArray[np.float32]:
-    """Images (k, rows, columns) less what remains of them when blurred."""
-    images = images.astype(np.float32)
-    if not blur:
-        return images
-    return np.stack([image - cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REFLECT) for image in images])
-
-
-def _brightness(places: NDArray, brightness: float, spread: float) -> tuple[float, float]:
-    """Median brightness of the particles, and how far they scatter about it, never less than so few can tell."""
-    if not len(places):
-        return brightness, spread
-    middle = float(np.median(places[:, 3]))
-    scatter = float(np.median(np.abs(places[:, 3] - middle))) / 0.6745
-    return middle, float(np.hypot(max(scatter, KNOWN * middle), 0.1 * middle / np.sqrt(len(places))))
-
-
-def _variance(light: NDArray, residual: NDArray, noise: float, bins: int = 12) -> NDArray[np.float64]:
-    """A pixel's variance as a line in the particles' light: photon noise over read noise.
-
-    The images' own errors grow with the square of the light. That is found, too, but left out: these errors are
-    those of a few patterns, not of single pixels, and to trust bright pixels less for them costs more than they do.
-    """
-    light, residual = np.abs(light[::3, ::3]).ravel(), np.abs(residual[::3, ::3]).ravel()  # enough of them
-    rank, dark = np.argsort(light), np.count_nonzero(light == 0)
-    # Of few particles, light falls on few pixels.
-    parts = [part for part in (rank[:dark], *np.array_split(rank[dark:], bins - 1)) if len(part) > 50]
-    values = np.array([(light[part].mean(), (np.median(residual[part]) / 0.6745) ** 2) for part in parts])
-    if len(values) < 4:
-        return np.array([0, noise**2])
-    light, variance = values.T
-    sure, brightest = 1 / np.maximum(variance, 0.25 * noise**2), max(light.max(), 1e-9)
-    terms = (light[:, None] / brightest) ** np.arange(3)
-    level, linear, _ = nnls(terms * sure[:, None], variance * sure)[0]
-    return np.array([linear / brightest, max(level, 0.25 * noise**2)])
-
-
-def _weight(light: NDArray[np.float32], variance: NDArray[np.float64]) -> NDArray[np.float32]:
-    """One over the variance of each pixel."""
-    weight = np.empty_like(light)
-    _fill_weight(light, *variance.astype(np.float32), weight)
-    return weight
+def _in_the_open(found: NDArray[np.float64], gain: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
+    """Which of the peaks (P, 4), best first, are not beside a far better one, whose side-lobes they may be."""
+    keep = np.ones(len(found), bool)
+    for i in range(len(found)):
+        better = keep[:i] & (gain[:i] > SIDE_LOBE * gain[i])
+        keep[i] = not (np.hypot(*(found[:i, :2][better] - found[i, :2]).T) < distance).any()
+    return keep
 
 
 @compiled
-def _fill_weight(light, linear, level, weight):  # pragma: no cover
-    for r in range(light.shape[0]):
-        for c in range(light.shape[1]):
-            weight[r, c] = 1 / (linear * abs(light[r, c]) + level)
+def _gain(maps, mix, cut, rows, columns, margin, centre, known, fraction, gain, best, bright):  # pragma: no cover
+    """Highest gain over the depths at each place, with the amplitude that brings it.
+
+    A particle of amplitude a changes minus the log-likelihood by a**2 e / 2 - a c + known (a - centre)**2 / 2;
+    c is its product with the residual, mixed from those of the singular images, and e its energy, less where the
+    frame's edge cuts it.
+    """
+    depths, (height, width) = len(mix), gain.shape
+    n = cut.shape[1] - 1
+    half = n // 2
+    aim, known = np.float32(centre * known), np.float32(known)
+    base, least = np.float32(centre**2) * known, np.float32(fraction * centre**2)
+    zero, half_of = np.float32(0), np.float32(0.5)
+    inverse = np.empty((depths, width), np.float32)
+    between, product = np.empty(n + 1, np.float32), np.empty(width, np.float32)
+    highest, argument = np.empty(width - 2 * margin, np.float32), np.empty(width - 2 * margin, np.int32)
+    before = (-1, -1)
+    for i in range(margin, height - margin):
+        top, bottom = max(0, 2 * half - i), min(n, rows - i + 2 * half)
+        if (top, bottom) != before:
+            before = (top, bottom)
+            for z in range(depths):
+                for j in range(n + 1):
+                    between[j] = cut[z, bottom, j] - cut[z, top, j]
+                inverse[z, :] = 1 / max(between[n] + known, np.float32(1e-9))
+                for j in range(width):
+                    if 2 * half <= j <= columns - n + 2 * half:
+                        continue  # it is not cut at the left or right
+                    left, right = max(0, 2 * half - j), min(n, columns - j + 2 * half)
+                    inverse[z, j] = 1 / max(between[right] - between[left] + known, np.float32(1e-9))
+        highest[:] = 0
+        argument[:] = 0
+        for z in range(depths):
+            product[:] = aim
+            for k in range(len(maps)):
+                factor, map_ = mix[z, k], maps[k, i]
+                for j in range(width):
+                    product[j] += factor * map_[j]
+            inner, per = product[margin:], inverse[z, margin:]
+            for j in range(len(highest)):  # from 0: an index that cannot be negative is far faster
+                c = max(inner[j], zero)
+                g = c * c * per[j]
+                better = g > highest[j]
+                highest[j] = g if better else highest[j]
+                argument[j] = z if better else argument[j]
+        for j in range(len(highest)):
+            per = inverse[argument[j], margin + j]
+            value = half_of * (highest[j] - base)
+            gain[i, margin + j] = value if value > half_of * least * (1 / per - known) else zero
+            best[i, margin + j] = argument[j]
+            bright[i, margin + j] = np.sqrt(highest[j] * per)  # c / (e + known)
+
+
+def smooth_power(spectrum: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """Power of a spectrum, (rows, columns / 2 + 1), smoothed over `sigma` frequency steps."""
+    squares = spectrum**2
+    inner = squares[:, 1:-1:2] + squares[:, 2:-1:2]
+    # The outermost columns are packed in another way; their neighbours stand in for them.
+    return gaussian_filter(np.pad(inner, ((0, 0), (1, 1)), mode="edge"), sigma, mode=("wrap", "nearest"))
+
+
+def packed(half: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Factors (rows, columns / 2 + 1) of a spectrum in OpenCV's order."""
+    out = np.repeat(half[:, 1:], 2, axis=1)
+    rows = (np.arange(len(half)) + 1) // 2
+    return np.column_stack([half[rows, 0], out[:, :-2], half[rows, -1]])

@@ -1,11 +1,10 @@
-"""A simulated device that runs by the clock: particles move, a camera looks, and the sound can be switched off.
+"""A simulated device that runs by the clock: particles move, a camera takes frames, the sound can be switched off.
 
-Another process renders each frame when its time has come, so that the camera goes on whatever this process does.
-What the camera saw can be computed again afterwards: a `Film` of `Switched` trajectories is the same, bit for bit.
+Another process renders each frame when its time has come, so that this process cannot delay the camera. The frames can
+be computed again afterwards: those of a `Film` of `Switched` trajectories are the same, bit for bit.
 """
 
 import os
-import signal
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from threading import Event, Lock
@@ -21,10 +20,12 @@ from gdptlab.experiment.channel import Trajectories
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
 from gdptlab.live.monitor import Frame, MiddleThird, Monitor, Result, Trigger
-from gdptlab.live.own_process import PROCESSES
+from gdptlab.live.own_process import PROCESSES, follow_parent
 
 SLOTS = 16
-"""Frames that wait to be grabbed; if there would be more, the oldest is overwritten."""
+"""Number of frames that may wait to be grabbed; while all slots are full, the camera's frames are lost and counted.
+Chosen: 0.64 s at 25 frames/s, and 8 MB of frames of 512 x 512 px. With 1, a grabber that is late by a moment loses a
+frame; with hundreds, it would be handed frames that are seconds old."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,7 +72,7 @@ class Switched(Trajectories):
 
 
 def switched(film: Film, off_s: float | None) -> Film:
-    """The same film, had the sound been switched off at `off_s`."""
+    """Return the film that would have been taken if the sound had been switched off at `off_s`."""
     old = film.trajectories
     fields = {name: getattr(old, name) for name in ("focusing", "start", "duration_s", "view_length_um")}
     return replace(film, trajectories=Switched(**fields, off_s=off_s))
@@ -80,7 +81,7 @@ def switched(film: Film, off_s: float | None) -> Film:
 class Device:
     """Channel, sound, microscope and camera, in another process that keeps to the clock.
 
-    It is a source for a `Monitor`. One device does one experiment after the other. Use it in a `with` block, or
+    A device is a source for a `Monitor`. It does one experiment after the other. Use it in a `with` block, or
     `close` it; it ends with the program in any case. A program that is a file must start it under
     ``if __name__ == "__main__":``, since the process reads that file, too.
 
@@ -94,7 +95,7 @@ class Device:
     start_s : float
         When the experiment began, on the clock of `time.perf_counter`; NaN before.
     shown : list of int
-        For each frame that was grabbed in this experiment its number in the film.
+        Number in the film of each frame that was grabbed in this experiment.
     """
 
     def __init__(self, shape: tuple[int, int] = (512, 512)) -> None:
@@ -129,22 +130,22 @@ class Device:
         self._orders.close(), self._bell.close()
 
     def run(self, film: Film, *, ahead: int = 0) -> None:
-        """Make an experiment ready. With the first `grab` it begins: the sound is on, frames come at the film's rate.
+        """Prepare an experiment. It begins with the first `grab`: the sound is on, frames come at the film's rate.
 
-        A frame that takes longer to render than the camera allows makes the camera skip the next.
+        If a frame takes longer to render than the time between frames, the camera skips the next.
 
         Parameters
         ----------
         film : Film
-            What happens if nobody switches the sound off.
+            Of the experiment if nobody switches the sound off.
         ahead : int
-            Render so many frames before the clock starts, and show these to and fro: for rates that rendering could
-            not keep up with. Switching the sound off then changes nothing in them. 0: render each in its time.
+            Number of frames that are rendered before the clock starts, and then shown to and fro: for rates that
+            rendering could not keep up with. Switching the sound off does not change them. 0: render each in its time.
 
         Raises
         ------
         TypeError, ValueError
-            If that is no film, or not of the camera's shape, or has fewer frames than are to be rendered ahead.
+            If `film` is no film or not of the camera's shape, or `ahead` is above its number of frames.
         RuntimeError
             If the process is gone.
         """
@@ -171,7 +172,7 @@ class Device:
             pass
 
     def grab(self) -> Frame | None:
-        """The next frame, as soon as there is one; None if the experiment is over."""
+        """Return the next frame, as soon as there is one; None if the experiment is over."""
         run = self._run
         while True:
             with self._one_at_a_time:  # a monitor that was stopped may still be waiting for its last frame
@@ -196,30 +197,30 @@ class Device:
                 return Frame(frame, t_s)
 
     def switch_off(self, _: object = None) -> None:
-        """Switch the sound off, now. What it is given does not matter, so it can be the action of a `Trigger`."""
+        """Switch the sound off, now. The argument has no effect: it lets the method be the action of a `Trigger`."""
         if np.isnan(self._shared.off_s.value):
             self._shared.off_s.value = perf_counter()
 
     @property
     def off_s(self) -> float | None:
-        """When the sound was switched off, in seconds since the experiment began; None if it was not."""
+        """Time at which the sound was switched off, s since the experiment began; None if it was not."""
         off_s = self._shared.off_s.value - self.start_s
         return None if np.isnan(off_s) else off_s
 
     @property
     def missed(self) -> int:
-        """Frames that could not be delivered because nobody grabbed."""
+        """Number of frames that were lost because all slots were full."""
         return self._shared.missed.value
 
     @property
     def film(self) -> Film | None:
-        """What happened in the experiment, as far as is known: the film, with the sound switched off when it was."""
+        """The film of the experiment so far, with the sound switched off when it was; None before the first."""
         return self._film and switched(self._film, self.off_s)
 
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """Memory that both processes see: pixels of the slots, frames taken, frames missed, switches."""
+    """Memory that both processes use: pixels of the slots, numbers of frames taken and missed, switches."""
 
     pixels: Any
     taken: Any
@@ -229,12 +230,13 @@ class _Shared:
 
 
 def _slot(pixels: Any, shape: tuple[int, int], number: int) -> NDArray[np.uint16]:
+    """Return the shared memory of the frame of this number, (rows, columns)."""
     return np.frombuffer(pixels, np.uint16).reshape(SLOTS, *shape)[number % SLOTS]
 
 
 def _camera(orders: Any, bell: Any, shared: _Shared, shape: tuple[int, int]) -> None:
-    """The device's process: one experiment after the other, until the orders end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the program that started this one
+    """Do one experiment after the other, until the orders end (the device's process)."""
+    follow_parent()
     try:
         while True:
             film, ahead = orders.recv()
@@ -265,11 +267,11 @@ def _camera(orders: Any, bell: Any, shared: _Shared, shape: tuple[int, int]) -> 
         pass
 
 
-# -------------------- sound switched by a monitor, or by a timer
+# -------------------- the sound switched off by a monitor, or by a timer
 
 
 def true_fractions(film: Film, times_s: ArrayLike) -> pd.DataFrame:
-    """Fraction of the particles in view that are in the middle thirds, by the truth.
+    """Return the true fraction of the particles in view that are in the middle thirds.
 
     Parameters
     ----------
@@ -280,7 +282,7 @@ def true_fractions(film: Film, times_s: ArrayLike) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        `t_s`, `count`, `fraction_h`, `fraction_w`, as in `replay.fractions`.
+        `t_s`, `count`, `fraction_h`, `fraction_w`, as in `experiment.fractions`.
     """
     table = fractions(film.trajectories.table(times_s), np.arange(len(times_s)), film.trajectories.focusing.channel)
     return table.drop(columns="frame").assign(t_s=times_s)
@@ -296,7 +298,7 @@ def closed_loop(
     linger_s: float = 0.2,
     log: str | os.PathLike[str] | None = None,
 ) -> dict[str, float]:
-    """One experiment in real time, in which a monitor switches the sound off when the particles are in the middle.
+    """Do one experiment in real time: a monitor switches the sound off when the particles are in the middle.
 
     Parameters
     ----------
@@ -305,11 +307,11 @@ def closed_loop(
     evaluate : callable
         As of a `Monitor`.
     of : str
-        'h' or 'w': of which middle third.
+        Middle third of the height, 'h', or of the width, 'w'.
     level : float
         Fraction at which the sound is switched off (paper: 0.9).
     linger_s : float
-        For which it goes on afterwards.
+        Time for which the experiment goes on afterwards.
     log : str or path-like, optional
         As of a `Monitor`.
 
@@ -317,16 +319,17 @@ def closed_loop(
     -------
     dict
         `seed`, `energy_density_J_m3`; `needed_s`, when the true fraction reached the level (NaN: never); `off_s`, when
-        the sound was switched off, and `true_fraction` then; `exposed_s` and `delivered_s`, the two times of the frame
-        that did it, and `fraction`, what was measured in it: all NaN if it never was; `delay_ms` from its delivery and
-        `exposure_delay_ms` from its exposure until the sound was off; `frames` that the camera delivered until the
-        end, and `dropped`.
+        the sound was switched off, and `true_fraction` then; `exposed_s` and `delivered_s`, when the deciding frame
+        was exposed and delivered, and `fraction`, measured in it: all NaN if the sound was never switched off;
+        `delay_ms` from the frame's delivery and `exposure_delay_ms` from its exposure until the sound was off;
+        `frames`, the number that the camera delivered until the end, and `dropped`.
     """
     channel = film.trajectories.focusing.channel
     middle = MiddleThird(of=of, channel=channel, to_channel=film.to_channel)
     off = Event()
 
     def act(_: Result) -> None:
+        """Switch the sound off, and tell the waiting thread."""
         device.switch_off()
         off.set()
 
@@ -358,7 +361,7 @@ def closed_loop(
 
 
 def timed(films: Iterable[Film], timers_s: ArrayLike, of: str = "w") -> pd.DataFrame:
-    """The same experiments, had a timer switched the sound off: no clock needs to run for that.
+    """Compute the same experiments with a timer that switches the sound off; no clock needs to run for that.
 
     Parameters
     ----------

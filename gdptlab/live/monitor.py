@@ -1,13 +1,14 @@
-"""A monitor beside a running camera: it looks at the newest frame, decides, acts, and writes down what it saw.
+"""A monitor beside a running camera: it evaluates the newest frame, decides, acts, and logs the result.
 
-Two threads share one slot. One takes frames from the source as they come and puts each into the slot, on top of
-what is there; the other takes what is in the slot, evaluates it, and decides. So the camera never waits, memory is
-that of two or three frames however fast it is, and what is evaluated is always the newest; a frame that is
-overwritten before anyone saw it is dropped, and counted. The clock of `replay.watch` is the same thing on paper.
+Two threads share one slot. One thread takes frames from the source as they come and puts each into the slot, on top of
+the frame that is there; the other takes the frame in the slot, evaluates it, and decides. So the camera never waits,
+memory holds two or three frames however fast the camera is, and the frame evaluated is always the newest; a frame that
+is overwritten before it was taken is dropped, and counted. `replay.watch` computes the same clock without waiting.
 
-Nothing that goes wrong with a frame stops the loop: it is counted, written to the log, and the next one is taken.
+No error of a frame stops the loop: the error is counted and logged, and the next frame is taken. An error that the
+loop cannot survive ends it in the state 'failed', which `status` shows and `wait` raises.
 
-A thread shares Python's interpreter with whatever else the program does, such as drawing. An evaluator wrapped in
+A thread shares Python's interpreter with the rest of the program, such as drawing. An evaluator wrapped in
 `OwnProcess` works in another process, and drawing delays it no more than a busy core would.
 
 All times are those of `time.perf_counter`, which is one clock for all processes of a machine.
@@ -26,14 +27,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, positive, real_array, whole
+from gdptlab._checks import choice, number, positive, real_array, whole
 from gdptlab.experiment.channel import Channel
 from gdptlab.experiment.trigger import in_middle_third
 from gdptlab.live.logbook import Logbook
 from gdptlab.live.own_process import as_text
 
 DIGITS = 3
-"""Decimals of a particle's numbers in the log."""
+"""Number of decimals of a particle's numbers in the log. Chosen: the least error measured is some 0.01 px. With 1,
+the log would add an error of its own; with all digits, it would be three times as long."""
 
 # -------------------- what goes in
 
@@ -47,20 +49,29 @@ class Frame:
     image : array (rows, columns)
     t_s : float
         On the clock of `time.perf_counter`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the time is not a finite number.
     """
 
     image: ArrayLike
     t_s: float
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "t_s", number("t_s", self.t_s))
+
 
 def at_speed(frames: Iterable[ArrayLike], rate_hz: float) -> Iterator[ArrayLike]:
-    """Hand out frames at true speed: the first at once, frame i at i / rate_hz, none before its time.
+    """Yield frames at true speed: the first at once, frame i at i / rate_hz, none before its time.
 
     Parameters
     ----------
     frames : iterable of arrays (rows, columns)
-        Such as a `Film`; if one is not ready in time it comes late, and so may those that follow.
+        Such as a `Film`. A frame that is not ready in time comes late, and so may the frames after it.
     rate_hz : float
+        Frames in a second.
 
     Yields
     ------
@@ -74,6 +85,7 @@ def at_speed(frames: Iterable[ArrayLike], rate_hz: float) -> Iterator[ArrayLike]
     period_s = 1 / positive("rate_hz", rate_hz)
 
     def paced() -> Iterator[ArrayLike]:
+        """Sleep until the time of each frame (the check of the rate must not wait for the first)."""
         start = perf_counter()
         for i, frame in enumerate(frames):
             sleep(max(start + i * period_s - perf_counter(), 0))
@@ -89,7 +101,7 @@ class MiddleThird:
     Attributes
     ----------
     of : str
-        'h' (|z| ≤ h/6) or 'w' (|y| ≤ w/6), as in `replay.fractions`.
+        'h' (|z| ≤ h/6) or 'w' (|y| ≤ w/6), as in `experiment.fractions`.
     channel : Channel
     to_channel : callable
         Table of an evaluator -> the same with `y_um` and `z_um`, measured from the channel's middle; for example
@@ -112,13 +124,13 @@ class MiddleThird:
         _function("to_channel", self.to_channel)
 
     def __call__(self, table: pd.DataFrame) -> float:
-        """Fraction, from 0 to 1; NaN without particles."""
+        """Return the fraction, from 0 to 1; NaN without particles."""
         inside = in_middle_third(self.to_channel(table), self.of, self.channel)
         return float(inside.mean()) if len(inside) else np.nan
 
 
 def middle_thirds(channel: Channel, to_channel: Callable[[pd.DataFrame], pd.DataFrame]) -> dict[str, MiddleThird]:
-    """Of height and width, by 'h' and 'w': two that convert a frame's table once.
+    """Return the `MiddleThird` of height, 'h', and of width, 'w', which convert the table of a frame only once.
 
     Parameters
     ----------
@@ -134,6 +146,7 @@ def middle_thirds(channel: Channel, to_channel: Callable[[pd.DataFrame], pd.Data
     last: tuple[pd.DataFrame | None, pd.DataFrame | None] = (None, None)
 
     def converted(table: pd.DataFrame) -> pd.DataFrame:
+        """Convert a table, unless it is the one converted last."""
         nonlocal last
         if table is not last[0]:
             last = table, to_channel(table)
@@ -146,8 +159,8 @@ def middle_thirds(channel: Channel, to_channel: Callable[[pd.DataFrame], pd.Data
 class Trigger:
     """When to act.
 
-    It goes on with the first frame whose fraction is at or above `level`, and off again with the first whose fraction
-    is below `release`. Between the two, and in a frame with fewer than `least` particles, it stays as it is.
+    The trigger goes on with the first frame whose fraction is at or above `level`, and off again with the first whose
+    fraction is below `release`. Between the two, and in a frame with fewer than `least` particles, it does not change.
 
     Attributes
     ----------
@@ -157,13 +170,13 @@ class Trigger:
     action : callable
         Called with the `Result` when the trigger goes on, in the evaluating thread: the next frame waits for it.
     released : callable, optional
-        Likewise when it goes off.
+        Called with the `Result` when the trigger goes off.
     level : float
-        (Paper: 0.9.)
+        Fraction at which the trigger goes on (paper: 0.9).
     release : float
-        At most `level`.
+        Fraction below which the trigger goes off; at most `level`.
     least : int
-        Particles that a frame must have.
+        Smallest number of particles in a frame that may change the trigger.
 
     Raises
     ------
@@ -191,13 +204,14 @@ class Trigger:
         whole("least", self.least, 0, 2**31)
 
     def after(self, on: bool, fraction: float, count: int) -> bool:
-        """Whether it is on after a frame, given whether it was on before."""
+        """Return whether the trigger is on after a frame, given whether it was on before."""
         if count < self.least:
             return on
         return bool(fraction >= (self.release if on else self.level) or (on and np.isnan(fraction)))
 
 
 def _function(name: str, value: Any) -> None:
+    """Refuse a value that cannot be called."""
     if not callable(value):
         raise TypeError(f"{name}: got {value!r}, allowed is a function")
 
@@ -212,22 +226,22 @@ class Result:
     Attributes
     ----------
     frame : int
-        Its number among all that the source delivered, from 0.
+        Its number among all frames of the source, from 0.
     t_s, decision_s : float
-        When it was delivered, and when it was decided what it means.
+        When it was delivered, and when its evaluation ended.
     dropped : int
-        Frames that nobody saw between this one and the one looked at before.
+        Number of frames dropped between this one and the one evaluated before.
     image : array (rows, columns), or what else came
     table : DataFrame
         From the evaluator; without rows if there is an error.
     fraction : dict
         Of each trigger, by name; empty if there is an error.
     on : dict
-        Which triggers are on now.
+        Whether each trigger is on, by name.
     changed : tuple of str
-        Those that went on or off with this frame.
+        Names of the triggers that went on or off with this frame.
     error : str
-        Why it could not be evaluated; empty if it could.
+        Why the frame could not be evaluated; empty if it could.
     """
 
     frame: int
@@ -251,30 +265,32 @@ class Result:
 class Status:
     """How a monitor is doing.
 
-    Rates and latencies are of the last frames only, as many as the monitor's `window`.
+    Rates and latencies are those of the last `window` frames.
 
     Attributes
     ----------
     state : str
-        'ready', 'running', 'ended' (the source did, and all is evaluated) or 'stopped'.
+        'ready', 'running', 'ended' (the source has no more frames, and all are evaluated), 'stopped', or 'failed' (an
+        error ended the loop).
     grabbed, evaluated, failed, dropped : int
-        Frames that came; that were evaluated; that could not be; that nobody saw. Up to two more are under way.
+        Numbers of frames that came, that were evaluated, that could not be evaluated, and that were dropped. Up to two
+        more are under way.
     camera_hz, rate_hz : float
-        Frames that came, and that were looked at, in a second; NaN before there are two.
+        Frames that came, and that were evaluated, in a second; NaN before there are two at different times.
     latency_median_ms, latency_p99_ms, latency_max_ms : float
         From a frame's delivery to the decision; NaN before the first.
     waiting_s : float
         Since the last frame came, or the start.
     count : int
-        Particles in the last frame that was evaluated.
+        Number of particles in the last frame that was evaluated.
     fraction, on : dict
         Of each trigger, by name.
     actions_failed : int
-        Actions of triggers that raised.
+        Number of actions of triggers that raised an error.
     error : str
-        The last there was, of a frame, an action or the source; empty if there was none.
+        The last error of a frame, an action, the source or the loop; empty if there was none.
     log_written, log_waiting, log_lost : int
-        Lines on the disk, on the way there, and lost.
+        Numbers of lines on the disk, on the way there, and lost.
     log_problem : str
         Why the log cannot be written at present; empty if it can.
     """
@@ -305,34 +321,34 @@ class Status:
 
 
 class Monitor:
-    """Look at the newest frame of a source, decide, act, write it down, and take the newest again.
+    """Evaluate the newest frame of a source, decide, act, log the result, and take the newest frame again.
 
     Use it in a `with` block, which stops it at the end, or `start` and `stop` it.
 
     Parameters
     ----------
     source : object
-        Of frames: a camera with a method `grab`, or a function, either of which is called for one frame after the
-        other and waits until there is one (None: no more); or anything to loop over, such as `at_speed(film, 25)`.
-        A frame is an array, whose time is the moment it comes, or a `Frame`, which brings its own.
+        A camera with a method `grab`, or a function: it is called for one frame after the other, and waits until there
+        is one (None: no more). Or an iterable of frames, such as `at_speed(film, 25)`. A frame is an array, whose
+        time is the moment at which it comes, or a `Frame`, which has a time of its own.
     evaluate : callable
         image -> DataFrame with a row for each particle: a `replay.Method`, `functools.partial(locate,
         calibration=...)`, or an `OwnProcess` around one of these.
     triggers : sequence of Trigger
     log : str or path-like, optional
-        File to which a line is added for each frame looked at (see `logbook`).
+        File to which a line is added for each frame evaluated (see `logbook`).
     log_particles : bool
-        Put the particles into the log, too: about 3 kB for 100 of them.
+        Put the particles into the log, too: about 3 kB for 100 particles.
     example : array (rows, columns), optional
         A frame like those to come. It is evaluated at the start, so that what is made at first use is there when
         the first frame comes; and frames of another shape are refused. Without it the first frame sets the shape.
     window : int
-        Frames that rates, latencies and `recent` go back.
+        Number of last frames in rates, latencies and `recent`.
 
     Attributes
     ----------
     started_s : float
-        When it began to take frames; NaN before.
+        When the monitor began to take frames; NaN before.
 
     Raises
     ------
@@ -387,7 +403,7 @@ class Monitor:
         Raises
         ------
         RuntimeError
-            If it was started before, or the example cannot be evaluated.
+            If the monitor was started before, or the example cannot be evaluated.
         OSError
             If the log cannot be opened.
         """
@@ -406,14 +422,23 @@ class Monitor:
             thread.start()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the source has ended and all is evaluated; False if that takes longer than `timeout_s`."""
-        return self._finished.wait(timeout_s)
+        """Wait until the source has ended and all frames are evaluated; False if that takes longer than `timeout_s`.
+
+        Raises
+        ------
+        RuntimeError
+            If an error ended the loop (state 'failed').
+        """
+        finished = self._finished.wait(timeout_s)
+        if self._state == "failed":
+            raise RuntimeError(f"the monitor failed: {self._error}")
+        return finished
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """Finish the frame under evaluation, if that takes no longer than `timeout_s`, and close the log.
 
-        A source that waits for a frame is left behind waiting: it ends with the program. An action may call this,
-        too; then the log is closed where the `with` block ends, or by another call.
+        A source that waits for a frame goes on waiting until the program ends. An action may call `stop`, too; then
+        the log is closed where the `with` block ends, or by another call.
         """
         self._stopping.set()
         with self._changed:
@@ -422,10 +447,11 @@ class Monitor:
             return
         if self._state == "running":
             self._finished.wait(timeout_s)
-            self._threads[0].join(0.2)  # it is through, unless its source waits
+            self._threads[0].join(0.2)  # it ends at once, unless its source waits
         self._close()
 
     def _close(self) -> None:
+        """Set the state at the end, and close the log."""
         with self._lock:
             self._state = "stopped" if self._state in ("ready", "running") else self._state
         if self._log is not None:
@@ -435,17 +461,17 @@ class Monitor:
 
     @property
     def latest(self) -> Result | None:
-        """Of the frame last looked at."""
+        """Result of the frame evaluated last."""
         return self._latest
 
     def recent(self) -> pd.DataFrame:
-        """The last frames looked at: `frame`, `t_s` and `decision_s` since the start, `latency_ms`, `dropped`,
+        """Return the last frames evaluated: `frame`, `t_s` and `decision_s` since the start, `latency_ms`, `dropped`,
         `count`, `error`, and `fraction_NAME`, `on_NAME` of each trigger."""
         with self._lock:
             return pd.DataFrame(list(self._rows))
 
     def status(self) -> Status:
-        """How it is doing."""
+        """Return state, counts, rates and the last error."""
         with self._lock:
             latency = np.array([row["latency_ms"] for row in self._rows] or [np.nan])
             since = self._last_s if self._grabbed else self.started_s
@@ -481,11 +507,7 @@ class Monitor:
             for item in _frames(self._source):
                 if self._stopping.is_set():
                     break
-                frame = item if isinstance(item, Frame) else Frame(item, perf_counter())
-                try:
-                    frame = Frame(np.array(frame.image), frame.t_s)  # a camera may use its memory again
-                except ValueError:
-                    pass  # no array; it is refused where frames are evaluated
+                frame = _copied(item if isinstance(item, Frame) else Frame(item, perf_counter()))
                 with self._lock:
                     number, self._grabbed = self._grabbed, self._grabbed + 1
                     self._last_s = perf_counter()
@@ -496,7 +518,7 @@ class Monitor:
                 if missed is not None:
                     with self._lock:
                         self._dropped += 1
-        except Exception as error:
+        except BaseException as error:  # sys.exit as well: in a thread, nobody would see it
             with self._lock:
                 self._error = f"source: {as_text(error)}"
             self._write({"event": "source failed", "error": as_text(error), "t_s": perf_counter()})
@@ -506,7 +528,23 @@ class Monitor:
                 self._changed.notify()
 
     def _watch(self) -> None:
-        """Take what is in the slot, evaluate it, decide, act."""
+        """Run the loop, and note whether the source, `stop` or an error ended it."""
+        try:
+            self._loop()
+            state, error = "stopped" if self._stopping.is_set() else "ended", ""
+        except BaseException as caught:
+            state, error = "failed", as_text(caught)
+        with self._lock:
+            self._state, self._error = state, error or self._error
+        self._stopping.set()  # nobody takes the frames that the source may still deliver
+        try:
+            event = {"event": state, "grabbed": self._grabbed, "dropped": self._dropped, "t_s": perf_counter()}
+            self._write(event | ({"error": error} if error else {}))
+        finally:
+            self._finished.set()
+
+    def _loop(self) -> None:
+        """Take the frame in the slot, evaluate it, decide, act, and log it, until there are no more."""
         last = -1
         while True:
             with self._changed:
@@ -517,14 +555,12 @@ class Monitor:
             number, frame = taken
             result = self._decided(number, frame, number - last - 1)
             last = number
-            self._acted(result)
+            self._noted(result, self._acted(result))
         with self._lock:
             self._dropped += taken is not None  # by a stop
-            self._state = "stopped" if self._stopping.is_set() else "ended"
-        self._write({"event": self._state, "grabbed": self._grabbed, "dropped": self._dropped, "t_s": perf_counter()})
-        self._finished.set()
 
     def _decided(self, number: int, frame: Frame, dropped: int) -> Result:
+        """Evaluate a frame, and decide which triggers are on; any error becomes the result's."""
         try:
             table = self._evaluate(self._checked(frame.image))
             if not isinstance(table, pd.DataFrame):
@@ -534,7 +570,7 @@ class Monitor:
             fraction = {t.name: float(t.fraction(table)) for t in self._triggers}
             on = {t.name: t.after(self._on[t.name], fraction[t.name], len(table)) for t in self._triggers}
             error = ""
-        except Exception as caught:
+        except BaseException as caught:  # sys.exit as well
             table, fraction, on, error = pd.DataFrame(), {}, self._on, as_text(caught)
         return Result(
             frame=number,
@@ -550,6 +586,7 @@ class Monitor:
         )
 
     def _checked(self, image: Any) -> NDArray:
+        """Return a frame as an array (rows, columns) of finite numbers in the shape of those before, or refuse it."""
         image = np.asarray(image)
         if image.ndim != 2 or image.dtype.kind not in "buif":
             raise ValueError(f"frame: got {image.dtype} of shape {image.shape}, allowed are numbers on two axes")
@@ -561,7 +598,8 @@ class Monitor:
             raise ValueError("frame: got NaN or infinity, allowed are finite numbers")
         return image
 
-    def _acted(self, result: Result) -> None:
+    def _acted(self, result: Result) -> list[str]:
+        """Call the actions of the triggers that changed, and return the errors that they raised."""
         failures = []
         for trigger in self._triggers:
             if trigger.name in result.changed:
@@ -569,14 +607,17 @@ class Monitor:
                 try:
                     if call is not None:
                         call(result)
-                except Exception as error:
+                except BaseException as error:  # sys.exit as well
                     failures.append(f"{trigger.name}: {as_text(error)}")
+        return failures
+
+    def _noted(self, result: Result, failures: list[str]) -> None:
+        """Count the result and the errors of actions, keep them for `status` and `recent`, and log them."""
         done_s = perf_counter()
         plain = {"frame": result.frame, "dropped": result.dropped, "count": len(result.table), "error": result.error}
         row = {"t_s": result.t_s - self.started_s, "decision_s": result.decision_s - self.started_s}
-        by_name = {f"fraction_{n}": s for n, s in result.fraction.items()} | {
-            f"on_{n}": o for n, o in result.on.items()
-        }
+        by_name = {f"fraction_{name}": value for name, value in result.fraction.items()}
+        by_name |= {f"on_{name}": value for name, value in result.on.items()}
         with self._lock:
             self._latest, self._on = result, result.on
             if result.error:
@@ -586,20 +627,21 @@ class Monitor:
             self._actions_failed += len(failures)
             self._error = (failures or [result.error or self._error])[-1]
             self._rows.append(plain | row | {"latency_ms": result.latency_ms} | by_name)
-        if self._log is not None:
-            line = plain | {"t_s": result.t_s, "decision_s": result.decision_s, "done_s": done_s}
-            line |= {"action_error": "; ".join(failures), "fraction": result.fraction, "on": result.on}
-            if self._log_particles and len(result.table):
-                columns = result.table.select_dtypes(["number", "bool"])
-                line["particles"] = {name: columns[name].round(DIGITS).tolist() for name in columns}
-            self._write(line)
+        line = plain | {"t_s": result.t_s, "decision_s": result.decision_s, "done_s": done_s}
+        line |= {"action_error": "; ".join(failures), "fraction": result.fraction, "on": result.on}
+        if self._log_particles and len(result.table):
+            columns = result.table.select_dtypes(["number", "bool"])
+            line["particles"] = {name: columns[name].round(DIGITS).tolist() for name in columns}
+        self._write(line)
 
     def _write(self, record: dict[str, Any]) -> None:
+        """Add a line to the log, if there is one."""
         if self._log is not None:
             self._log.append(record)
 
 
 def _frames(source: Any) -> Iterator[Any]:
+    """Yield the frames of a camera, a function or an iterable."""
     take = getattr(source, "grab", source)
     if not callable(take):
         yield from source
@@ -608,5 +650,15 @@ def _frames(source: Any) -> Iterator[Any]:
             yield frame
 
 
+def _copied(frame: Frame) -> Frame:
+    """Return a copy, as a camera may use its memory again; or the frame itself if its image is no array."""
+    try:
+        return Frame(np.array(frame.image), frame.t_s)
+    except BaseException:  # the error comes again, and is noted, where the frame is evaluated
+        return frame
+
+
 def _rate(times_s: list[float]) -> float:
-    return (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 else np.nan
+    """Return the number of times (n,) in a second, NaN if they do not differ."""
+    span_s = times_s[-1] - times_s[0] if times_s else 0.0
+    return (len(times_s) - 1) / span_s if span_s > 0 else np.nan

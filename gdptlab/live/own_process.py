@@ -1,9 +1,16 @@
-"""Evaluate frames in another process: what this one is busy with, such as drawing, does not delay it."""
+"""Evaluate frames in another process: what this one is busy with, such as drawing, does not delay it.
+
+`concurrent.futures.ProcessPoolExecutor` would take fewer lines, but it cannot end a worker that hangs (before Python
+3.14), and its workers go on when the program that started them is killed.
+"""
 
 import multiprocessing
+import os
 import pickle
 import signal
 from collections.abc import Callable
+from contextlib import suppress
+from threading import RLock, Thread
 from typing import Any, Self
 
 import pandas as pd
@@ -12,25 +19,27 @@ from numpy.typing import NDArray
 from gdptlab._checks import positive
 
 PROCESSES = multiprocessing.get_context("spawn")
-"""How processes are started: afresh, on every system. A copy of this one could hold a lock that nobody releases."""
+"""How processes are started: afresh, on every system. A forked copy of this process could hold a lock for ever."""
 
 START_S = 120.0
-"""How long a process may take to start."""
+"""Longest time, s, that a process may take to start, and that the very first frame may take. Chosen: imports take
+some seconds and the compilation of machine code some ten, on a busy machine four times as long. Much shorter, a slow
+start counts as a failure; much longer, the caller of a process that hangs waits in vain."""
 
 
 class OwnProcess:
-    """Evaluate frames in a process of its own; if it dies, or takes too long, the next frame starts another.
+    """Evaluate frames in a process of its own; if that process dies or takes too long, the next frame starts another.
 
-    It takes some seconds to start, and serves one `Monitor` after the other. Use it in a `with` block, or `stop`
-    it; it ends with the program in any case. A program that is a file must start it under
-    ``if __name__ == "__main__":``, since the process reads that file, too.
+    The process takes some seconds to start, and serves one `Monitor` after the other. Threads that call it wait for
+    each other. Use it in a `with` block, or `stop` it; it ends with the program in any case. A program that is a file
+    must start it under ``if __name__ == "__main__":``, since the process reads that file, too.
 
     Parameters
     ----------
     evaluate : callable
-        image -> DataFrame, that can be pickled: what it consists of comes from modules, not from a notebook.
+        image -> DataFrame, that can be pickled: its parts come from modules, not from a notebook.
     timeout_s : float
-        For one frame.
+        Longest time for one frame, but for the first, which may have to wait for machine code to be compiled.
 
     Raises
     ------
@@ -47,11 +56,11 @@ class OwnProcess:
             self._pickled = pickle.dumps(evaluate)
         except Exception as error:
             raise TypeError(
-                f"evaluate: got {evaluate!r}, which a process of its own cannot be given ({as_text(error)}); allowed "
-                "is what comes from modules, not from a notebook's cells"
+                f"evaluate: got {evaluate!r}, which cannot be sent to another process ({as_text(error)}); allowed is a "
+                "function from a module, not from a notebook's cells"
             ) from error
         self._timeout_s = positive("timeout_s", timeout_s)
-        self._process = None
+        self._process, self._number, self._one_caller, self._answered = None, 0, RLock(), False
 
     def __enter__(self) -> Self:
         self.start()
@@ -61,81 +70,98 @@ class OwnProcess:
         self.stop()
 
     def start(self) -> None:
-        """Start the process, if it does not run, and wait until it is there.
+        """Start the process, if it does not run, and wait until it is ready.
 
         Raises
         ------
         RuntimeError
             If it cannot be started.
         """
-        if self._process is not None:
-            return
-        self._connection, other = PROCESSES.Pipe()
-        self._process = PROCESSES.Process(target=_serve, args=(other, self._pickled), daemon=True)
-        self._process.start()
-        other.close()  # so that either process sees the end of the other
-        self._answer(START_S)
+        with self._one_caller:
+            if self._process is not None:
+                return
+            self._connection, other = PROCESSES.Pipe()
+            self._process = PROCESSES.Process(target=_serve, args=(other,), daemon=True)
+            self._process.start()
+            other.close()  # so that this process notices the end of the other
+            try:
+                self._answer(self._pickled, START_S)
+            except RuntimeError:
+                self.stop()
+                raise
 
     def __call__(self, image: NDArray) -> pd.DataFrame:
-        """Evaluate a frame there.
+        """Evaluate a frame in the process.
 
         Raises
         ------
         RuntimeError
-            With the text of what was raised there, or if it died or took too long.
+            With the text of the error that was raised there, or if the process died or took too long.
         """
-        self.start()
-        try:
-            self._connection.send(image)
-        except OSError:
-            pass  # it is gone, as no answer will tell
-        return self._answer(self._timeout_s)
+        with self._one_caller:
+            self.start()
+            table = self._answer(image, self._timeout_s if self._answered else max(START_S, self._timeout_s))
+            self._answered = True
+            return table
 
-    def _answer(self, timeout_s: float) -> Any:
+    def _answer(self, request: Any, timeout_s: float) -> pd.DataFrame | None:
+        """Send a request, and return the answer that carries its number."""
+        self._number += 1
         try:
-            if not self._connection.poll(timeout_s):
-                raise TimeoutError(f"no answer for {timeout_s:g} s")
-            error, table = self._connection.recv()
+            self._connection.send((self._number, request))
+            number = None
+            while number != self._number:
+                if not self._connection.poll(timeout_s):
+                    raise TimeoutError(f"no answer for {timeout_s:g} s")
+                number, error, table = self._connection.recv()
         except (EOFError, OSError) as lost:
             self.stop()
-            raise RuntimeError(
-                f"the evaluating process is lost, {as_text(lost)}; the next frame starts another"
-            ) from lost
+            text = f"the evaluating process is lost, {as_text(lost)}; the next frame starts another"
+            raise RuntimeError(text) from lost
+        except BaseException:  # an interrupt: the next caller need not wait for this frame
+            self.stop()
+            raise
         if error:
             raise RuntimeError(error)
         return table
 
     def stop(self) -> None:
-        """End the process, at once."""
-        if self._process is not None:
-            self._connection.close()
+        """End the process at once; a thread that waits for its answer gets a RuntimeError."""
+        with suppress(AttributeError, ValueError):  # there is none, or another thread has closed it
             self._process.kill()
-            self._process.join()
-            self._process.close()
-            self._process = None
+        with self._one_caller:
+            if self._process is not None:
+                self._process.join()
+                self._process.close()
+                self._connection.close()
+                self._process = None
 
 
-def _serve(connection: Any, pickled: bytes) -> None:
-    """Evaluate what comes through the connection, until it is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the program that started this one
-    try:
-        evaluate = pickle.loads(pickled)
-    except Exception as error:
-        connection.send((as_text(error), None))
-        return
-    connection.send(("", None))
-    try:
+def _serve(connection: Any) -> None:
+    """Unpickle the evaluator in the first request through the connection, and evaluate the frames in all others."""
+    follow_parent()
+    evaluate = None
+    with suppress(EOFError, OSError):
         while True:
-            image = connection.recv()
+            number, request = connection.recv()
+            error, table = "", None
             try:
-                answer = "", evaluate(image)
-            except Exception as error:
-                answer = as_text(error), None
-            connection.send(answer)
-    except (EOFError, OSError):
-        pass
+                if evaluate is None:
+                    evaluate = pickle.loads(request)
+                else:
+                    table = evaluate(request)
+            except Exception as raised:
+                error = as_text(raised)
+            connection.send((number, error, table))
+
+
+def follow_parent() -> None:
+    """In a child process: leave interrupts to the parent, and end at once when the parent has ended or was killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    Thread(target=lambda: (parent.join(), os._exit(1)), name="follow parent", daemon=True).start()
 
 
 def as_text(error: BaseException) -> str:
-    """Kind of an error, and what it says."""
+    """Return the kind of an error, and what it says."""
     return f"{type(error).__name__}: {error}"

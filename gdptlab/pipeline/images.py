@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Self, overload
+from typing import Any, NamedTuple, Self, overload
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,16 +15,35 @@ import pandas as pd
 import tifffile
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from gdptlab._checks import number, real_array
+from gdptlab._checks import number, real_array, whole
 
 SUFFIXES = (".tif", ".tiff")
-"""Of the files that are looked for in a folder, in lower or upper case."""
+"""Ends of the names of files that are looked for in a folder, in lower or upper case."""
 
 UM = {"m": 1e6, "cm": 1e4, "mm": 1e3, "µm": 1.0, "μm": 1.0, "um": 1.0, "micron": 1.0, r"\u00B5m": 1.0, "nm": 1e-3}
-"""Units of length that image files use, in µm. (There are two letters µ.)"""
+"""Units of length that image files and their names use, in µm. (There are two letters µ.)"""
+
+NUMBER = r"[-+]?[0-9]+(?:[.,][0-9]+)?(?:[eE][-+][0-9]+)?"
+"""Regular expression of a number in a file name: with a sign, decimals after a point or a comma, and an exponent."""
+
+MOST_CHANNELS = 7
+"""Largest number of channels. ImageJ allows no more; a longer axis that says channel is one of time or depth (files
+that tifffile writes for ImageJ, without being told axes, call it channel)."""
 
 COLOUR = "for a colour image choose the channel with the particles, or the mean of all, and save it as grey"
-"""Advice."""
+"""Advice in the error about a colour image."""
+
+
+class File(NamedTuple):
+    """A file of images.
+
+    path: absolute. raw: whether its images lie in it one after the other, as numbers. stamp: its size (bytes) and time
+    of change (ns) when it was opened; None if it was not looked at then.
+    """
+
+    path: Path
+    raw: bool
+    stamp: tuple[int, int] | None
 
 
 class Images(Sequence):
@@ -45,12 +64,12 @@ class Images(Sequence):
 
     def __init__(
         self,
-        files: Sequence[tuple[Path, bool]],
+        files: Sequence[File],
         places: NDArray[np.int64],
         frame: tuple[tuple[int, int], np.dtype],
         um_per_px: float | None,
     ) -> None:
-        # A place is the number of a file, and where in it the image is described or, if the file is raw, begins.
+        # A row of places is the number of a file, and where in it an image is described or, if the file is raw, begins.
         used, number_of_file = np.unique(places[:, 0], return_inverse=True)
         self._files = [files[i] for i in used]
         self._places = np.stack([number_of_file, places[:, 1]], axis=1)
@@ -68,7 +87,12 @@ class Images(Sequence):
     @property
     def names(self) -> list[str]:
         """Name of the file that each image is in."""
-        return [self._files[i][0].name for i in self._places[:, 0]]
+        return [self._files[i].path.name for i in self._places[:, 0]]
+
+    @property
+    def paths(self) -> list[Path]:
+        """Absolute paths of the files, each once."""
+        return [file.path for file in self._files]
 
     def __repr__(self) -> str:
         n, rows, columns = self.shape
@@ -94,8 +118,10 @@ class Images(Sequence):
     def __iter__(self) -> Iterator[NDArray]:
         (rows, columns), dtype = self._frame
         for file, places in groupby(self._places.tolist(), lambda place: place[0]):
-            path, raw = self._files[file]
+            path, raw, stamp = self._files[file]
             with _opened(path) as tif:
+                if stamp not in (None, _stamp(path)):
+                    raise ValueError(f"path: got {path.name!r}, which has changed since it was opened: open it again")
                 for _, offset in places:
                     if raw:
                         tif.filehandle.seek(offset)
@@ -119,7 +145,7 @@ class Images(Sequence):
         return images
 
 
-def open_images(path: str | os.PathLike[str]) -> Images:
+def open_images(path: str | os.PathLike[str], *, channel: int | None = None, position: int | None = None) -> Images:
     """Open grey images in TIFF files, without reading them yet.
 
     Arrays of any kind (memory maps, dask arrays, sequences of pims) need no opening: `batch` takes them as they are.
@@ -128,21 +154,27 @@ def open_images(path: str | os.PathLike[str]) -> Images:
     ----------
     path : str or path-like
         A file of one or more images (OME-TIFF and ImageJ included; a set of OME-TIFFs by any one of them), a folder
-        of such files, or a folder and a pattern, as in "film/*_green.tif". Files are sorted by name, numbers in
-        it by their value: frame2 before frame10. Where the first holds one image, so must all.
+        of such files, or a folder and a pattern, as in "film/*_green.tif". Where the first holds one image, so must
+        all. Files are sorted by name, numbers in it by their value: frame2 before frame10. Where the names give depths
+        (as `open_scan` reads them: z_-50, z_0, z_50) the files are sorted by depth.
+    channel : int, optional
+        Number of the channel, from 0, in files that have several.
+    position : int, optional
+        Number of the position on the slide, from 0, in OME-TIFFs that have several.
 
     Returns
     -------
     Images
         A sequence of arrays (rows, columns), of 8 or 16 bit or floating point as in the files. Reading raises
-        ValueError where a file is damaged, or its images are not like those of the first.
+        ValueError where a file is damaged or was changed, or its images are not like those of the first.
 
     Raises
     ------
     TypeError, FileNotFoundError
         If `path` is no path, or there is no such file, or none in the folder.
     ValueError
-        If a file is no TIFF, is damaged, or does not hold grey images of one size and type.
+        If a file is no TIFF, is damaged, or does not hold grey images of one size and type; if it has several channels
+        or positions and none is chosen, or one that it does not have; if an OME-TIFF names files in other folders.
 
     Examples
     --------
@@ -153,26 +185,33 @@ def open_images(path: str | os.PathLike[str]) -> Images:
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(f"path: got a {type(path).__name__}, allowed is the path of a file or a folder")
-    paths = _paths(Path(path))
-    files, places, frame, um_per_px = [], [], None, None
+    chosen = {
+        name: None if value is None else whole(name, value, 0, 10_000)
+        for name, value in (("channel", channel), ("position", position))
+    }
+    paths = _paths(Path(path).absolute())
+    number, files, places, frame, um_per_px = {}, [], [], None, None
     for path in paths:
-        if any(path == known for known, _ in files):  # of a set of OME-TIFFs
+        if path in number:  # a part of a set of OME-TIFFs
             continue
         with _opened(path) as tif:
-            here, um = _frame_of(tif, path), _um_per_px(tif)
-            found, raw = _found(tif, path)
+            _must_stay_in_folder(tif, path)
+            series = _series(tif, path, chosen["position"])
+            here, um = _frame_of(series, path), _um_per_px(tif)
+            found, raw = _found(tif, series, path, chosen["channel"])
         frame, um_per_px = frame or here, um_per_px or um
         if here != frame:
             raise _refused(path, f"another size or type than {paths[0].name!r}", "are images of one size and type")
         if len(paths) > 1 and not files and len(found) == 1:
             # One image in each of perhaps 100 000 files: they are looked at when they are read.
-            files = [(path, False) for path in paths]
+            files = [File(path, False, None) for path in paths]
             places = [(i, 0) for i in range(len(paths))]
             break
         for file, offset in found:
-            if not files or files[-1][0] != file:
-                files.append((file, raw))
-            places.append((len(files) - 1, offset))
+            if file not in number:
+                number[file] = len(files)
+                files.append(File(file, raw, _stamp(file)))
+            places.append((number[file], offset))
     return Images(files, np.array(places, dtype=np.int64), frame, um_per_px)
 
 
@@ -183,11 +222,14 @@ def open_scan(
     step_um: float | None = None,
     csv: str | os.PathLike[str] | None = None,
     names: str | None = None,
+    channel: int | None = None,
+    position: int | None = None,
 ) -> tuple[Images, NDArray[np.float64]]:
     """Open the images of a calibration scan, and find their depths.
 
     The depths come from where they begin and the step between two images; from a CSV file; or, if neither is given,
-    from the file names, which then should differ in one number.
+    from the file names. These then differ in one number, which is a depth in µm if it follows a z, or has a sign,
+    decimals or a unit of length (z_-2.5, z-2,5um, 1500nm, z1e+01).
 
     Parameters
     ----------
@@ -196,9 +238,12 @@ def open_scan(
     start_um, step_um : float, optional
         Depth of the first image, and from each to the next (negative if the scan went down).
     csv : str or path-like, optional
-        A table with a column `z_um` and a row for each image, in their order.
+        A table with a column `z_um` and a row for each image, in their order. With semicolons between the columns,
+        decimals follow a comma.
     names : str, optional
-        A regular expression that finds the depth in a file name as its only group, as in r"_z(-?[0-9.]+)um".
+        A regular expression that finds the depth, µm, in a file name as its only group, as in r"_z(-?[0-9.]+)um".
+    channel, position : int, optional
+        As for `open_images`.
 
     Returns
     -------
@@ -209,7 +254,8 @@ def open_scan(
     Raises
     ------
     TypeError, FileNotFoundError, ValueError
-        As `open_images`; also if the depths cannot be told for certain, are not finite, or not one for each image.
+        As `open_images`; also if the depths cannot be told for certain, repeat, are not finite, or not one for each
+        image.
 
     Examples
     --------
@@ -218,7 +264,7 @@ def open_scan(
     >>> len(scan), float(z_um[0]), float(z_um[-1])
     (51, -50.0, 50.0)
     """
-    images = open_images(path)
+    images = open_images(path, channel=channel, position=position)
     given = [name for name, value in (("start_um", start_um), ("csv", csv), ("names", names)) if value is not None]
     if len(given) > 1 or (start_um is None) != (step_um is None):
         raise ValueError("start_um, step_um, csv, names: got too many or too few, allowed are the first two or one")
@@ -235,68 +281,108 @@ def open_scan(
 
 
 def _depths_of_table(path: str | os.PathLike[str], n: int) -> NDArray[np.float64]:
-    """Column z_um of a CSV file, if it has a number for each of `n` images."""
+    """Column z_um of a CSV file, if it has a number for each of `n` images: (n,)."""
     try:
-        table = pd.read_csv(path)
+        with open(path, encoding="utf-8-sig") as file:
+            european = ";" in file.readline()
+        table = pd.read_csv(path, encoding="utf-8-sig", **({"sep": ";", "decimal": ","} if european else {}))
     except FileNotFoundError as error:
         raise FileNotFoundError(f"csv: got {str(path)!r}, where there is no file") from error
     except Exception as error:  # of many kinds
         raise ValueError(f"csv: got {path!r}, which cannot be read: {error}") from error
+    if not isinstance(table.index, pd.RangeIndex):
+        raise ValueError("csv: got more columns than names of columns, allowed are points as in 1.5, not commas")
     if "z_um" not in table or len(table) != n:
         raise ValueError(
             f"csv: got {len(table)} rows with columns {list(table)}, allowed is a column z_um and a row for each of "
             f"{n} images"
         )
     real_array("csv", table["z_um"], 1)
-    return table["z_um"].to_numpy(dtype=np.float64)
+    return _unrepeated("csv", table["z_um"].to_numpy(dtype=np.float64))
 
 
-def _depths_of_names(files: list[str], pattern: str | None) -> NDArray[np.float64]:
-    """The number in which file names differ, or that which a pattern finds."""
-    stems = [Path(file).stem for file in files]
-    advice = "give names=, a pattern that finds the depth, or start_um= and step_um=, or csv="
-    if pattern is not None:
-        try:
-            found = [re.search(pattern, stem) for stem in stems]
-        except (re.error, TypeError) as error:
-            raise ValueError(f"names: got {pattern!r}, which is no regular expression: {error}") from error
-        lost = [stem for stem, match in zip(stems, found, strict=True) if match is None or len(match.groups()) != 1]
-        if lost:
-            raise ValueError(f"names: got {pattern!r}, which finds no group, or several, in {lost[0]!r}")
-        numbers = [[match[1]] for match in found]
-    else:
-        numbers = [re.findall(r"[-+]?[0-9]+(?:[.,][0-9]+)?", stem) for stem in stems]
-        if len({len(each) for each in numbers}) > 1:
-            raise ValueError(f"path: got file names with more and with fewer numbers, as {stems[0]!r}; {advice}")
-        columns = [column for column in zip(*numbers, strict=True) if len(set(column)) > 1]
-        if len(columns) != 1:
-            raise ValueError(f"path: got file names that differ in {len(columns)} numbers, as {stems[0]!r}; {advice}")
-        if all(each.startswith("-") for each in columns[0]):
-            raise ValueError(f"path: got file names as {stems[0]!r}, where - may be a hyphen or a minus; {advice}")
-        numbers = [[each] for each in columns[0]]
-    try:
-        z_um = np.array([float(each.replace(",", ".")) for (each,) in numbers])
-    except ValueError as error:
-        raise ValueError(f"names: got {pattern!r}, which finds what is no number: {error}") from error
-    if len(set(z_um)) < len(z_um):
-        raise ValueError(f"path: got file names in which depths repeat, as {stems[0]!r}; {advice}")
+def _unrepeated(name: str, z_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return depths (n,) if none of them is there twice."""
+    value, count = np.unique(z_um, return_counts=True)
+    if (count > 1).any():
+        raise ValueError(f"{name}: got the depth {value[count > 1][0]:g} µm {count.max()} times, allowed is once")
     return z_um
 
 
+def _depths_of_names(files: list[str], pattern: str | None) -> NDArray[np.float64]:
+    """Depths (n,) by the number in which file names differ, or by that which a pattern finds."""
+    stems = [Path(file).stem for file in files]
+    if pattern is None:
+        return _unrepeated("path", _depths_of_stems(stems))
+    try:
+        found = [re.search(pattern, stem) for stem in stems]
+    except (re.error, TypeError) as error:
+        raise ValueError(f"names: got {pattern!r}, which is no regular expression: {error}") from error
+    lost = [stem for stem, match in zip(stems, found, strict=True) if match is None or len(match.groups()) != 1]
+    if lost:
+        raise ValueError(f"names: got {pattern!r}, which finds no group, or several, in {lost[0]!r}")
+    try:
+        return _unrepeated("names", np.array([float(match[1].replace(",", ".")) for match in found]))
+    except (ValueError, AttributeError) as error:
+        if str(error).startswith("names:"):
+            raise
+        raise ValueError(f"names: got {pattern!r}, which finds what is no number: {error}") from error
+
+
+def _depths_of_stems(stems: list[str]) -> NDArray[np.float64]:
+    """Depths (n,) in µm by the one number in which names differ, if that is certainly a depth."""
+    said = f"path: got file names as {stems[0]!r}"
+    advice = "give names=, a pattern that finds the depth, or start_um= and step_um=, or csv="
+    numbers = [list(re.finditer(NUMBER, stem)) for stem in stems]
+    if len({len(each) for each in numbers}) > 1:
+        raise ValueError(f"{said}, some with more and some with fewer numbers; {advice}")
+    columns = [each for each in zip(*numbers, strict=True) if len({number[0] for number in each}) > 1]
+    if len(columns) != 1:
+        raise ValueError(f"{said}, which differ in {len(columns)} numbers; {advice}")
+    column = columns[0]
+    texts = [number[0] for number in column]
+    if all(text.startswith("-") for text in texts):
+        raise ValueError(f"{said}, where - may be a hyphen or a minus; {advice}")
+    units = [_unit_after(number) for number in column]
+    signed = any(text[0] in "-+" or not text.isdecimal() for text in texts)
+    after_z = all(re.search(r"(?:^|[^a-z])z[ _=]*$", number.string[: number.start()].lower()) for number in column)
+    if not (signed or after_z or all(units)):
+        raise ValueError(f"{said}, whose numbers may count images or be depths; {advice}")
+    if len({bool(unit) for unit in units}) > 1:
+        raise ValueError(f"{said}, some with a unit of length and some without; {advice}")
+    return np.array([float(text.replace(",", ".")) * (unit or 1) for text, unit in zip(texts, units, strict=True)])
+
+
+def _unit_after(number: re.Match) -> float | None:
+    """Unit of length, in µm, that follows a number in a name; None if none does."""
+    letters = re.match(r"[ _]?([a-zµμ]+)(?![a-zµμ])", number.string[number.end() :])
+    return UM.get(letters[1]) if letters else None
+
+
 def _paths(path: Path) -> list[Path]:
-    """Files that are meant by a path, in the order of their names."""
+    """Files that are meant by an absolute path, in their order."""
     try:
         folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
+        if folder is not path and (path.exists() or not re.search(r"[*?\[]", pattern)):
+            if not path.exists():
+                raise FileNotFoundError(f"path: got {str(path)!r}, where there is no file")
+            if not path.is_file():
+                raise ValueError(f"path: got {str(path)!r}, which is a device or a pipe, allowed is a file or a folder")
+            return [path]
     except OSError as error:  # a name too long, or a folder that is locked
+        if isinstance(error, FileNotFoundError):
+            raise
         raise ValueError(f"path: got {str(path)[:200]!r}, which cannot be looked at: {error.strerror}") from error
-    if folder is not path and (path.exists() or not re.search(r"[*?\[]", pattern)):
-        if not path.exists():
-            raise FileNotFoundError(f"path: got {str(path)!r}, where there is no file")
-        return [path]
     found = [p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
+    found = [p for p in found if p.is_file()]
     if not found:
         raise FileNotFoundError(f"path: got {str(path)!r}, where there is no file that ends in {' or '.join(SUFFIXES)}")
-    return sorted(found, key=_by_number)
+    found.sort(key=_by_number)
+    try:
+        depths = _depths_of_stems([p.stem for p in found])
+    except ValueError:  # the names give no depths, or not for certain
+        return found
+    return [found[i] for i in np.argsort(depths, kind="stable")]
 
 
 def _by_number(path: Path) -> tuple[list[str | int], str]:
@@ -305,23 +391,66 @@ def _by_number(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
-def _found(tif: tifffile.TiffFile, path: Path) -> tuple[list[tuple[Path, int]], bool]:
-    """File and place of each image, and whether they lie there raw, one after the other."""
+def _stamp(path: Path) -> tuple[int, int]:
+    """Size (bytes) and time of change (ns) of a file."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def _must_stay_in_folder(tif: tifffile.TiffFile, path: Path) -> None:
+    """Refuse an OME-TIFF that names files in other folders, before they are opened."""
+    if tif.is_ome:
+        for uuid in ElementTree.fromstring(tif.ome_metadata).iterfind(".//{*}UUID"):
+            name = uuid.get("FileName", "")
+            if re.search(r"[/\\]", name):
+                raise _refused(path, f"images in another folder, {name!r}", "are files of one folder")
+
+
+def _series(tif: tifffile.TiffFile, path: Path, position: int | None) -> list[tifffile.TiffPageSeries]:
+    """Series of images of a file; of an OME-TIFF, where each is a position, the one that was chosen."""
     series = tif.series
+    several = len(series) if tif.is_ome else 1
+    if position is None and several > 1:
+        raise _refused(path, f"{several} positions", f"is one: choose it, position=0 to {several - 1}")
+    if position is not None and position >= several:
+        raise ValueError(f"position: got {position}, allowed are 0 to {several - 1} in {path.name!r}")
+    return series[position or 0 :][:1] if tif.is_ome else series
+
+
+def _found(
+    tif: tifffile.TiffFile, series: list[tifffile.TiffPageSeries], path: Path, channel: int | None
+) -> tuple[list[tuple[Path, int]], bool]:
+    """File and place of each image of a channel, and whether they lie there raw, one after the other."""
     raw = series[0].dataoffset
-    if any(len(one.axes.replace("Y", "").replace("X", "").replace("S", "")) > 1 for one in series):
-        kind = f"images along the axes {series[0].axes} of lengths {series[0].shape}"
-        raise _refused(path, kind, "is one axis, time or depth, beside rows and columns: save a film for each channel")
-    plain = len(series) == 1 and raw is not None and not series[0].is_multifile
-    if plain:
+    chosen = [_of_channel(one, path, channel) for one in series]
+    if len(series) == 1 and raw is not None and not series[0].is_multifile:
         n, size = int(np.prod(series[0].shape[:-2])), series[0].keyframe.nbytes
         if raw + n * size > tif.filehandle.size:
             raise _refused(path, f"{n} images in a file that is cut off", "are whole files")
-        return [(path, raw + k * size) for k in range(n)], True
-    pages = [page for one in series for page in one.pages]
+        return [(path, raw + k * size) for k in chosen[0].tolist()], True
+    pages = [one.pages[k] for one, which in zip(series, chosen, strict=True) for k in which.tolist()]
     if None in pages:
         raise _refused(path, "a file that lacks some of its images", "are whole files")
     return [(path.with_name(page.parent.filename), page.offset) for page in pages], False
+
+
+def _of_channel(series: tifffile.TiffPageSeries, path: Path, channel: int | None) -> NDArray[np.int64]:
+    """Numbers of the images, in the order of the file, that belong to a channel of a series."""
+    axes, shape = series.axes.replace("YX", ""), series.shape[: len(series.axes.replace("YX", ""))]
+    number = np.arange(int(np.prod(shape))).reshape(shape)
+    if axes == "C" and shape[0] > MOST_CHANNELS:
+        axes = "T"
+    channels = shape[axes.index("C")] if "C" in axes else 1
+    if channel is None and channels > 1:
+        raise _refused(path, f"{channels} channels", f"is one: choose it, channel=0 to {channels - 1}")
+    if channel is not None and channel >= channels:
+        raise ValueError(f"channel: got {channel}, allowed are 0 to {channels - 1} in {path.name!r}")
+    if "C" in axes:
+        number, axes = number.take(channel, axis=axes.index("C")), axes.replace("C", "")
+    if len(axes) > 1:
+        kind = f"images along the axes {series.axes} of lengths {series.shape}"
+        raise _refused(path, kind, "is one axis, time or depth, beside channel, rows and columns")
+    return number.ravel()
 
 
 def _only_image(tif: tifffile.TiffFile) -> NDArray:
@@ -331,9 +460,9 @@ def _only_image(tif: tifffile.TiffFile) -> NDArray:
     return tif.pages[0].asarray()
 
 
-def _frame_of(tif: tifffile.TiffFile, path: Path) -> tuple[tuple[int, int], np.dtype]:
-    """Shape and type of the images of a file, if all are grey and alike."""
-    kinds = {(one.keyframe.shape, one.keyframe.dtype) for one in tif.series}
+def _frame_of(series: list[tifffile.TiffPageSeries], path: Path) -> tuple[tuple[int, int], np.dtype]:
+    """Shape and type of the images of a file, if all are grey and of one size."""
+    kinds = {(one.keyframe.shape, one.keyframe.dtype) for one in series}
     shape, dtype = min(kinds, key=str)
     if len(shape) == 3 and min(shape[0], shape[2]) in (2, 3, 4):
         raise _refused(path, f"images of shape {shape}", f"are grey images: {COLOUR}")
@@ -343,7 +472,7 @@ def _frame_of(tif: tifffile.TiffFile, path: Path) -> tuple[tuple[int, int], np.d
 
 
 def _um_per_px(tif: tifffile.TiffFile) -> float | None:
-    """Size of a pixel, where OME or ImageJ have noted one that is the same along x and y."""
+    """Size of a pixel in µm, where OME or ImageJ have noted one that is the same along x and y."""
     sizes = []
     if tif.is_ome:
         pixels = ElementTree.fromstring(tif.ome_metadata).find(".//{*}Pixels")
@@ -361,10 +490,12 @@ def _um_per_px(tif: tifffile.TiffFile) -> float | None:
 
 
 def _described(images: NDArray | Images) -> str:
+    """Shape of an image, and type of its pixels, in words."""
     return f"{images.shape[-2:]} {images.dtype}"
 
 
 def _refused(path: Path, got: str, allowed: str) -> ValueError:
+    """Error that names a file, what it has, and what is allowed."""
     return ValueError(f"path: got {path.name!r} with {got}, allowed {allowed}")
 
 
@@ -377,7 +508,7 @@ def _opened(path: Path) -> Iterator[tifffile.TiffFile]:
     except FileNotFoundError:
         raise
     except Exception as error:  # of many kinds, for files that are no TIFF or are damaged
-        if str(error).startswith("path: got"):
+        if re.match("(path|channel|position): got", str(error)):
             raise
         raise ValueError(f"path: got {path.name!r}, which cannot be read as a TIFF: {error}") from error
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from gdptlab._checks import positive
 from gdptlab.calibration import Calibration
 from gdptlab.denoising import noise_level, signal_to_noise
+from gdptlab.fit.bounds import expected_error
 
 TWIN = 0.95
 """Correlation from which on images at two depths are mistaken for each other."""
@@ -30,7 +31,7 @@ def depth_quality(calibration: Calibration, noise: float | None = None) -> pd.Da
     -------
     DataFrame
         A row for each image: `z_um`; `signal_to_noise`, its height over the noise of a pixel; `z_std_um`, the least
-        error of z in such frames (`Calibration.expected_error`); `own_error_um`, what the stack's noise
+        error of z in such frames (`fit.expected_error`); `own_error_um`, what the stack's noise
         adds to it at every particle; `next_alike`, the correlation with the next image; and of the image most alike
         among those that are not just neighbours its correlation `twin` and depth `twin_um` (NaN if there is none).
     """
@@ -45,8 +46,8 @@ def depth_quality(calibration: Calibration, noise: float | None = None) -> pd.Da
         {
             "z_um": z_um,
             "signal_to_noise": signal_to_noise(calibration.stack) * own_noise / noise,
-            "z_std_um": calibration.expected_error(noise)["z_std_um"],
-            "own_error_um": calibration.own_error[:, 2],
+            "z_std_um": expected_error(calibration, noise=noise)["z_std_um"],
+            "own_error_um": calibration.model.own_error[:, 2],
             "next_alike": following,
             "twin": np.where(none, np.nan, alike[each, twins]),
             "twin_um": np.where(none, np.nan, z_um[twins]),

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from gdptlab._checks import choice, positive, real_array, whole
 from gdptlab.calibration import Calibration
 from gdptlab.denoising import noise_level
+from gdptlab.fit.pattern import particle_light
 from gdptlab.locate import METHODS, locate
 
 LOWEST = 0.2
@@ -176,7 +177,7 @@ def _ghosts(calibration: Calibration, noise: float, settings: dict[str, object])
     for k in np.unique(np.rint(np.linspace(0, len(calibration) - 1, DEPTHS)).astype(int)):
         frame = rng.normal(0, max(noise, 1e-9), (2 * size - 1, 2 * size - 1))
         near = slice(middle - size // 2, middle + size // 2 + 1)
-        frame[near, near] += calibration.images[k]
+        frame[near, near] += particle_light(calibration)[k]
         finds = locate(frame, calibration, threshold=LOWEST, **settings).assign(frame=k)
         own = np.hypot(finds["x_px"] - middle, finds["y_px"] - middle) < size / 4
         at.append(finds[own])

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
@@ -19,6 +20,17 @@ from gdptlab.pipeline.tables import about, as_json
 
 NOTE = "_about.json"
 """Name of the file that says how the table was made. What reads folders of Parquet skips names that begin with _."""
+
+PARTS = "_parts.csv"
+"""Name of the file that lists the parts that are whole: first frame, frames, bytes of each."""
+
+COMPUTING = ("numpy", "scipy", "opencv-python-headless", "numba")
+"""Packages whose version a table depends on, in its last digits."""
+
+LOOKED_AT = 32
+"""Number of frames, evenly spread from first to last, whose hash a film is known by. Derived: two films of which a
+fraction f of the frames differs are taken for one with a probability of (1 - f)**32, 1e-3 for a fifth; each takes a
+few milliseconds to read."""
 
 
 def batch_to_parquet(
@@ -50,49 +62,88 @@ def batch_to_parquet(
     Returns
     -------
     pathlib.Path
-        `folder`. In it are a file for each block of frames, named by the first and the last of them, and
-        `_about.json`: settings, versions, hash of the calibration, number of frames and hash of the first.
+        `folder`. In it are a file for each block of frames, named by the first and the last of them; `_parts.csv`,
+        which lists them; and `_about.json`: settings, versions, hashes of the calibration, of the package's sources
+        and of frames from the whole film, and their number.
 
     Raises
     ------
     TypeError, ValueError, FileNotFoundError
         As `batch` and `open_images`; also if the folder holds a table made with other frames, settings, calibration
-        or version of gdptlab (the message says what differs), or other files.
+        or software (the message says what differs), or other files.
     """
     frames = open_images(frames) if isinstance(frames, str | os.PathLike) else frames
     columns = list(blank_table(calibration, n_jobs, settings))
     folder = _claimed(folder, about(calibration, settings) | _film(frames))
-    done = {}
-    for path in folder.iterdir():
-        found = re.fullmatch(r"([0-9]+)-([0-9]+)\.parquet", path.name)
-        if found:
-            done[int(found[1])] = int(found[2]) - int(found[1]) + 1
+    done = _whole_parts(folder)
     with tqdm(total=len(frames), initial=sum(done.values()), desc="frames", unit="frame", disable=not progress) as bar:
         for first, n, table in in_blocks(frames, calibration, n_jobs, settings, done):
-            with written_whole(folder / f"{first:09d}-{first + n - 1:09d}.parquet") as temporary:
+            part = _part(folder, first, n)
+            with written_whole(part) as temporary:
                 table[columns].to_parquet(temporary, index=False)
+                _on_disk(temporary)
+            with open(folder / PARTS, "a", encoding="utf-8") as file:
+                file.write(f"{first},{n},{part.stat().st_size}\n")
+                file.flush()
+                os.fsync(file.fileno())
             bar.update(n)
     return folder
 
 
+def _part(folder: Path, first: int, n: int) -> Path:
+    """File of the block of `n` frames that begins with frame `first`."""
+    return folder / f"{first:09d}-{first + n - 1:09d}.parquet"
+
+
+def _on_disk(path: Path) -> None:
+    """Wait until a file is on the disk, and would be there after a power failure."""
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _whole_parts(folder: Path) -> dict[int, int]:
+    """First frame, and number of frames, of each part that is listed and has the size that is listed."""
+    done, listed = {}, folder / PARTS
+    for line in listed.read_text(encoding="utf-8").splitlines() if listed.exists() else []:
+        found = re.fullmatch(r"([0-9]+),([0-9]+),([0-9]+)", line)  # the last line of a run that was killed may be half
+        if found:
+            first, n, size = map(int, found.groups())
+            part = _part(folder, first, n)
+            if part.is_file() and part.stat().st_size == size:
+                done[first] = n
+            else:
+                done.pop(first, None)
+    return done
+
+
 def _film(frames: Sequence[ArrayLike]) -> dict[str, object]:
-    """What a film is known by: how many frames, in what blocks, and which is the first."""
+    """What a film is known by: how many frames, in what blocks, and the hash of frames from all of it."""
     try:
         n = len(frames)
-        first = frames[0] if n else None
+        looked = np.unique(np.rint(np.linspace(0, n - 1, LOOKED_AT)).astype(int)).tolist() if n else []
+        images = [frames[k] for k in looked]
     except (TypeError, LookupError) as error:
         raise TypeError(
             f"frames: got a {type(frames).__name__}, allowed is a path, or a sequence of arrays that has a length"
         ) from error
-    if first is None:
+    if not images:
         raise ValueError("frames: got none, allowed are one or more")
-    image = real_array("frames", first, 2)
-    pixels = hashlib.sha256(f"{image.shape}".encode() + image.tobytes()).hexdigest()
-    return {"frames": n, "block": BLOCK, "first_frame": pixels}
+    digest = hashlib.sha256()
+    for image in images:
+        image = real_array("frames", image, 2)
+        digest.update(f"{image.shape}".encode() + image.tobytes())
+    return {"frames": n, "block": BLOCK, "film": digest.hexdigest()}
+
+
+def _comparable(note: dict[str, object]) -> dict[str, object]:
+    """What must be the same for two parts of a table to belong together, of a note of how it was made."""
+    return {name: value for name, value in note.items() if name != "versions"} | {
+        name: note["versions"].get(name) for name in ("gdptlab", *COMPUTING)
+    }
 
 
 def _claimed(folder: str | os.PathLike[str], note: dict[str, object]) -> Path:
-    """Folder, new or of a table that is made as the note says."""
+    """Path of the folder, which is new or holds a table that was made as the note says."""
     if not isinstance(folder, str | os.PathLike):
         raise TypeError(f"folder: got a {type(folder).__name__}, allowed is the path of a folder")
     folder, note = Path(folder), json.loads(as_json(note))
@@ -108,12 +159,9 @@ def _claimed(folder: str | os.PathLike[str], note: dict[str, object]) -> Path:
         with written_whole(folder / NOTE) as temporary:
             temporary.write_text(as_json(note))
     try:
-        before = json.loads((folder / NOTE).read_text())
-        differ = [name for name in note if name != "versions" and before[name] != note[name]]
-        pairs = [(name, before[name], note[name]) for name in differ]
-        if before["versions"]["gdptlab"] != note["versions"]["gdptlab"]:
-            pairs.append(("gdptlab", before["versions"]["gdptlab"], note["versions"]["gdptlab"]))
-    except (ValueError, LookupError, TypeError) as error:
+        before = _comparable(json.loads((folder / NOTE).read_text()))
+        pairs = [(name, before.get(name), now) for name, now in _comparable(note).items() if before.get(name) != now]
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"folder: got {str(folder)!r}, whose {NOTE} is damaged") from error
     if pairs:
         said = "; ".join(f"{name} {old}, now {new}" for name, old, new in pairs)

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 
 from gdptlab import _checks as check
-from gdptlab._files import written_whole
+from gdptlab._files import sources_digest, written_whole
 from gdptlab._versions import versions
 from gdptlab.calibration import Calibration, checked
-from gdptlab.locate import locate
+from gdptlab.locate import THRESHOLD, locate
 
 POINTS = ("napari", "imagej")
 """Programs that `save_points` writes for."""
@@ -58,7 +58,15 @@ def about(calibration: Calibration, settings: dict[str, object]) -> dict[str, ob
     """What a table was made with: hash of the calibration, settings of `locate` and others, versions."""
     checked(calibration)
     unsaid = {name: p.default for name, p in signature(locate).parameters.items() if p.kind is p.KEYWORD_ONLY}
-    return {"calibration": fingerprint(calibration), "settings": unsaid | settings, "versions": versions()}
+    settings = unsaid | settings
+    if settings["method"] == "correlation" and settings["threshold"] is None:
+        settings["threshold"] = THRESHOLD
+    return {
+        "calibration": fingerprint(calibration),
+        "settings": settings,
+        "sources": sources_digest(),
+        "versions": versions(),
+    }
 
 
 def as_json(note: dict[str, object]) -> str:

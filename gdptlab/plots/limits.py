@@ -16,7 +16,7 @@ AXES = {
     "y (px)": ("y_std_px", "sigma_y_px"),
     "z (µm)": ("z_std_um", "sigma_z_um"),
 }
-"""Panel, with the columns of `Calibration.expected_error` and of `assessment.scores` in it."""
+"""Panel, with the columns of `fit.expected_error` and of `assessment.scores` in it."""
 
 
 def _points(i: int, label: str) -> dict[str, object]:
@@ -31,7 +31,7 @@ def expected_errors(expected: Mapping[str, pd.DataFrame]) -> Figure:
     Parameters
     ----------
     expected : dict of DataFrame
-        By name, from `Calibration.expected_error`.
+        By name, from `fit.expected_error`.
 
     Returns
     -------
@@ -54,7 +54,7 @@ def errors_against_bound(expected: pd.DataFrame, measured: Mapping[str, pd.DataF
     Parameters
     ----------
     expected : DataFrame
-        From `Calibration.expected_error`.
+        From `fit.expected_error`.
     measured : dict of DataFrame
         By the method's name, from `assessment.standard_assessment` with bins of z.
 

@@ -1,4 +1,4 @@
-"""From tables to tracks, velocities and the energy of the sound."""
+"""From tables to tracks, velocities, mean fields and the energy of the sound; export to ParaView and napari."""
 
 import lazy_loader
 
@@ -7,6 +7,8 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "tracks": ["identify", "link", "link_scores", "velocities"],
+        "fields": ["mean_field", "mean_squared_displacement"],
+        "export": ["napari_tracks", "save_paraview_field", "save_paraview_tracks"],
         "acoustic_energy": ["fit_energy", "imitate"],
     },
 )

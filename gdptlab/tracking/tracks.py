@@ -2,11 +2,12 @@
 
 Linking is trackpy's (J. C. Crocker and D. G. Grier, J. Colloid Interface Sci. 179 (1996) 298): of all ways to
 pair the particles of one frame with those of the next, the one with the least sum of squared distances. Here a
-distance is taken from where the flow would have carried the particle, in units of how far it may be off, which
-differs between the axes: depth is known least. Of the sound nothing is assumed, so tracks can be used to measure it.
+distance is taken from where the particle is expected, in units of the search range, which differs between the axes:
+depth is known least. Of the sound nothing is assumed, so tracks can be used to measure it.
 """
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
 from numbers import Real
 from typing import Protocol, runtime_checkable
 
@@ -14,16 +15,32 @@ import numpy as np
 import pandas as pd
 import trackpy
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import correlate1d
+from trackpy.predict import NearestVelocityPredict
 
 from gdptlab._checks import positive, whole
 from gdptlab._checks import table as check_table
 from gdptlab.assessment import match
 
+POSITION = ["x_um", "y_um", "z_um"]
+"""Columns of a position in µm."""
+
+POSITION_PX = ["x_px", "y_px", "z_um"]
+"""Columns of a position in a table that has no µm in the plane."""
+
+OUTSIDE = 0.1
+"""Largest fraction of positions that may lie outside a channel, by more than the search range. Chosen on a second of
+the paper's experiment, measured by correlation: none of 698 positions from the channel's middle lie there, 86 % of
+those from the first pixel. Larger, a table with another origin passes if its flow is in part of the frame; smaller,
+false finds stop the user."""
+
+LEAST_ROWS = 5
+"""Least number of positions in a window from which a velocity is fitted. Derived: a parabola has three coefficients,
+and two degrees of freedom are left to tell the scatter."""
+
 
 @runtime_checkable
 class Flow(Protocol):
-    """What `link` needs to know of a flow, such as an `experiment.Channel`."""
+    """Flow along x through a channel whose middle is at y = z = 0, such as an `experiment.Channel`."""
 
     width_um: float
     height_um: float
@@ -32,16 +49,30 @@ class Flow(Protocol):
         """Velocity along x (µm/s) at positions across the channel."""
 
 
-POSITION = ["x_um", "y_um", "z_um"]
-"""Columns of a position in the channel."""
+def positions_of(name: str, table: pd.DataFrame) -> list[str]:
+    """Columns of the positions in a table: `POSITION` if it has them all, or else `POSITION_PX`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is no table, or has neither; if a position is not finite.
+    """
+    check_table(name, table, ())
+    columns = POSITION if set(POSITION) <= set(table) else POSITION_PX
+    if not set(columns) <= set(table):
+        raise ValueError(f"{name}: got columns {list(table)}, needed are {', '.join(POSITION)}, or x_px and y_px")
+    check_table(name, table, columns)
+    if not np.isfinite(table[columns].to_numpy(dtype=float)).all():
+        raise ValueError(f"{name}: got positions that are NaN or infinite, allowed are finite ones")
+    return columns
 
 
 def link(
     table: pd.DataFrame,
-    channel: Flow,
-    frame_rate_hz: float,
     *,
-    reach_um: tuple[float, float, float] = (1.5, 1.5, 4.0),
+    search_range: tuple[float, float, float] = (1.5, 1.5, 4.0),
+    predictor: Flow | str | None = None,
+    frame_rate_hz: float | None = None,
     memory: int = 8,
     min_rows: int = 10,
 ) -> pd.DataFrame:
@@ -50,18 +81,24 @@ def link(
     Parameters
     ----------
     table : DataFrame
-        Positions in the channel, `x_um`, `y_um` and `z_um` (see `Film.to_channel`), of each `frame`, a whole number.
-    channel : Channel, or another `Flow`
-        It says how far downstream a particle is to be expected.
-    frame_rate_hz : float
-    reach_um : (x, y, z)
-        Half axes of the ellipsoid, around the expected position, in which a particle is looked for. To be chosen
-        larger than errors and than what sound moves it by in a frame (the default's: 0.6 µm along y and z), and
-        smaller than what is between particles.
+        Positions `x_um`, `y_um`, `z_um` (or, if it does not have these, `x_px`, `y_px`, `z_um`) of each `frame`, a
+        whole number.
+    search_range : (x, y, z)
+        Half axes of the ellipsoid, around the expected position, in which a particle is looked for, in the units of
+        the positions. To be chosen larger than errors, and than what a particle moves in a frame unpredicted; and
+        smaller than the distance between particles. The default is for the paper's experiment in µm, where sound moves
+        particles by 0.6 µm in a frame.
+    predictor : optional
+        Where a particle is expected. None: where it was. "nearest velocity": moved on as the particle nearest to it
+        moved between the two frames before (trackpy's), for flows that change little from frame to frame. A `Flow`,
+        such as an `experiment.Channel`: carried by it; positions then are in µm, and y and z from the channel's middle
+        (see `experiment.Film.to_channel`).
+    frame_rate_hz : float, optional
+        Needed with a `Flow`.
     memory : int
-        Longest gap, in frames, that a track may have; there it is continued by the flow alone.
+        Longest gap, in frames, that a track may have; there the prediction alone continues it.
     min_rows : int
-        Tracks of fewer rows are left out: they are most often nobody's.
+        Tracks of fewer rows are left out: they are most often of false finds.
 
     Returns
     -------
@@ -72,91 +109,132 @@ def link(
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range, a column is missing, a position is not finite or a frame not whole.
+        If an argument is out of range, a column is missing, a position is not finite or a frame not whole; with a
+        `Flow`, if more than `OUTSIDE` of the positions lie outside its channel.
 
     Examples
     --------
     >>> import pandas as pd
-    >>> from gdptlab.experiment import Channel
     >>> table = pd.DataFrame({"frame": [0, 0, 2], "x_um": [7.0, 60.0, 7.8], "y_um": [9.0, 50.0, 9.4], "z_um": 0.0})
-    >>> link(table, Channel(), 25.0, min_rows=2)  # in one frame of the three it was not found
+    >>> link(table, min_rows=2)  # in frame 1 the particle was not found
        frame  x_um  y_um  z_um  particle
     0      0   7.0   9.0   0.0         0
     1      2   7.8   9.4   0.0         0
     """
-    check_table("table", table, ["frame", *POSITION])
-    if not isinstance(channel, Flow):
-        raise TypeError(f"channel: got {channel!r}, allowed is a Channel")
-    positive("frame_rate_hz", frame_rate_hz)
-    reach = _reach(reach_um)
+    check_table("table", table, ["frame"])
+    columns, ranges = positions_of("table", table), _search_range(search_range)
     whole("memory", memory, 0, 10_000)
     whole("min_rows", min_rows, 1, 2**31)
-    if not np.isfinite(table[POSITION].to_numpy(dtype=float)).all():
-        raise ValueError("table: got positions that are NaN or infinite, allowed are finite ones")
     if table["frame"].dtype.kind not in "iu":
         raise TypeError(f"table: got frames of type {table['frame'].dtype}, allowed are whole numbers")
+    if isinstance(predictor, Flow):
+        positive("frame_rate_hz", frame_rate_hz)
+        _must_be_in_channel(table, predictor, ranges)
+    elif predictor not in (None, "nearest velocity"):
+        raise TypeError(f"predictor: got {predictor!r}, allowed are None, 'nearest velocity' and a Channel")
     if table.empty:
         return table.assign(particle=np.zeros(0, dtype=np.int64)).reset_index(drop=True)
-    half = np.array([channel.width_um, channel.height_um]) / 2
+    ordered = table.sort_values("frame", kind="stable", ignore_index=True).drop(columns="particle", errors="ignore")
+    number = pd.Series(np.concatenate(list(_linked(ordered, columns, ranges, predictor, frame_rate_hz, memory))))
+    kept = (number.groupby(number).transform("size") >= min_rows).to_numpy()
+    tracks = ordered[kept].assign(particle=pd.factorize(number[kept])[0].astype(np.int64))
+    return tracks.sort_values(["frame", "particle"], ignore_index=True)
+
+
+def _search_range(search_range: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Search range along x, y and z (3,), if it is one."""
+    ranges = tuple(search_range) if isinstance(search_range, tuple | list) else ()
+    if len(ranges) != 3 or not all(isinstance(r, Real) and 0 < r < np.inf for r in ranges):
+        raise ValueError(f"search_range: got {search_range!r}, allowed are three finite numbers above 0: x, y, z")
+    return np.array(ranges, dtype=float)
+
+
+def _must_be_in_channel(table: pd.DataFrame, flow: Flow, ranges: NDArray) -> None:
+    """Refuse a table whose positions are not those in the flow's channel."""
+    check_table("table", table, POSITION)
+    half = np.array([flow.width_um, flow.height_um]) / 2
+    outside = (table[["y_um", "z_um"]].abs() > half + ranges[1:]).any(axis=1)
+    if len(table) and outside.mean() > OUTSIDE:
+        raise ValueError(
+            f"table: got y_um, z_um of which {100 * outside.mean():.0f} % lie outside the channel, allowed are those "
+            "measured from its middle (see experiment.Film.to_channel)"
+        )
+
+
+def _linked(
+    ordered: pd.DataFrame,
+    columns: list[str],
+    ranges: NDArray,
+    predictor: Flow | str | None,
+    frame_rate_hz: float | None,
+    memory: int,
+) -> Iterator[NDArray[np.int64]]:
+    """Numbers (n,) of the tracks that the rows of each frame belong to, for a table sorted by frame."""
+    trackpy.quiet()  # or it reports every frame
+    frames = range(ordered["frame"].iloc[0], ordered["frame"].iloc[-1] + 1)
+    positions = np.split(ordered[columns].to_numpy(dtype=float), np.searchsorted(ordered["frame"], frames[1:]))
+    nearest = NearestVelocityPredict(pos_columns=columns) if predictor == "nearest velocity" else None
+    if nearest:
+        nearest.t_column, predict = "frame", nearest.predict
+    else:
+        predict = _carried(predictor, frame_rate_hz) if predictor else None
+    linked = trackpy.link_iter(  # not `link`: that upsets recent pandas
+        zip(frames, positions, strict=True),
+        tuple(ranges),
+        memory=memory,
+        predictor=predict,
+        adaptive_stop=ranges.min() / 20,  # where too many are in the range of each other, it is made smaller for them
+        adaptive_step=0.8,
+        link_strategy="recursive",  # the others would first be compiled, for longer than they save
+    )
+    for (frame, numbers), here in zip(linked, positions, strict=True):
+        if nearest and len(here):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that no particle is in both frames: then it predicts rest
+                nearest.observe(pd.DataFrame(here, columns=columns).assign(frame=frame, particle=numbers))
+        yield np.array(numbers, dtype=np.int64)
+
+
+def _carried(flow: Flow, frame_rate_hz: float) -> object:
+    """Predictor of trackpy's kind: particles carried along x by a flow."""
+    half = np.array([flow.width_um, flow.height_um]) / 2
 
     def expected(frame: int, particles: Iterable) -> NDArray[np.float64]:
         """Positions (n, 3) at a frame of trackpy's particles, seen last at theirs."""
         particles = list(particles)
-        place = np.array([p.pos for p in particles]).reshape(-1, 3)
+        position = np.array([p.pos for p in particles]).reshape(-1, 3)
         waited_s = (frame - np.array([p.t for p in particles])) / frame_rate_hz
-        inside = np.clip(place[:, 1:], -half, half)  # by their errors some are measured outside
-        return place + np.outer(channel.velocity(*inside.T) * waited_s, [1, 0, 0])
+        inside = np.clip(position[:, 1:], -half, half)  # by their errors some are measured outside
+        return position + np.outer(flow.velocity(*inside.T) * waited_s, [1, 0, 0])
 
-    trackpy.quiet()  # or it reports every frame
-    ordered = table.sort_values("frame", kind="stable", ignore_index=True)
-    frames = range(ordered["frame"].iloc[0], ordered["frame"].iloc[-1] + 1)
-    places = np.split(ordered[POSITION].to_numpy(dtype=float), np.searchsorted(ordered["frame"], frames[1:]))
-    linked = trackpy.link_iter(  # not `link`: that upsets recent pandas
-        zip(frames, places, strict=True),
-        tuple(reach),
-        memory=memory,
-        predictor=expected,
-        adaptive_stop=reach.min() / 20,  # where too many are in reach of each other, it is made smaller for them
-        adaptive_step=0.8,
-        link_strategy="recursive",  # the others would first be compiled, for longer than they save
-    )
-    number = pd.Series([particle for _, particles in linked for particle in particles])
-    ordered = ordered.drop(columns="particle", errors="ignore")
-    kept = (number.groupby(number).transform("size") >= min_rows).to_numpy()
-    ordered, number = ordered[kept], number[kept]
-    tracks = ordered.assign(particle=pd.factorize(number)[0].astype(np.int64))
-    return tracks.sort_values(["frame", "particle"], ignore_index=True)
-
-
-def _reach(reach_um: tuple[float, float, float]) -> NDArray[np.float64]:
-    reach = tuple(reach_um) if isinstance(reach_um, tuple | list) else ()
-    if len(reach) != 3 or not all(isinstance(r, Real) and 0 < r < np.inf for r in reach):
-        raise ValueError(f"reach_um: got {reach_um!r}, allowed are three finite numbers above 0: x, y, z")
-    return np.array(reach, dtype=float)
+    return expected
 
 
 # -------------------- velocities
 
 
-def velocities(tracks: pd.DataFrame, frame_rate_hz: float, *, window: int = 11) -> pd.DataFrame:
+def velocities(tracks: pd.DataFrame, frame_rate_hz: float | None = None, *, window: int = 11) -> pd.DataFrame:
     """Velocities along tracks, each from a parabola through the neighbouring frames.
 
-    Weighted least squares, frames without a measurement left out. A standard deviation follows from those of the
-    positions, enlarged where they scatter about the parabola by more than they should. Positions that are
-    off in the same way in many successive frames, and a calibration that is off in depth, it cannot know of.
+    Least squares, weighted if positions have standard deviations, frames without a measurement left out. The standard
+    deviation of a velocity follows from those of the positions, enlarged where they scatter about the parabola by
+    more than they should; or, if positions have none, from the scatter alone. Positions that are off in the same way in
+    many successive frames, and a calibration that is off in depth, it cannot know of.
 
     Parameters
     ----------
     tracks : DataFrame
-        From `link`, of positions that have standard deviations: `frame`, `particle`, and `x_um`, `x_std_um` and so on.
-    frame_rate_hz : float
+        From `link`: `frame`, `particle`, positions as there, and `x_std_um` and so on if they are known.
+    frame_rate_hz : float, optional
+        If not given, the time of each row is in its column `t_s`.
     window : int
         Frames, centred, from 5 to 1001; odd. The longer, the less noise, and the more of a bend is taken for straight.
 
     Returns
     -------
     DataFrame
-        Copy with `vx_um_s`, `vx_std_um_s` and so on; NaN where fewer than 5 frames of the window have a measurement.
+        Copy with `vx_um_s`, `vx_std_um_s` and so on (of positions in px, `vx_px_s`); NaN where fewer than `LEAST_ROWS`
+        frames of the window have a measurement.
 
     Raises
     ------
@@ -164,44 +242,66 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float, *, window: int = 11) 
         If an argument is out of range, a column is missing, a standard deviation is not above 0, or a
         particle is in a frame twice.
     """
-    stds = [f"{axis}_std_um" for axis in "xyz"]
-    check_table("tracks", tracks, ["frame", "particle", *POSITION, *stds])
-    step_s = 1 / positive("frame_rate_hz", frame_rate_hz)
-    if whole("window", window, 5, 1001) % 2 == 0:
+    check_table("tracks", tracks, ["frame", "particle"])
+    columns = positions_of("tracks", tracks)
+    stds = [f"{column[0]}_std{column[1:]}" for column in columns]
+    weighted = set(stds) <= set(tracks)
+    if whole("window", window, LEAST_ROWS, 1001) % 2 == 0:
         raise ValueError(f"window: got {window}, allowed are odd numbers")
-    if not (np.isfinite(tracks[POSITION]).all(axis=None) and (tracks[stds] > 0).all(axis=None)):
-        raise ValueError("tracks: got NaN, or a standard deviation of 0, allowed are finite numbers and above 0")
+    if weighted and not (check_table("tracks", tracks, stds)[stds] > 0).all(axis=None):
+        raise ValueError("tracks: got a standard deviation that is NaN or not above 0, allowed are those above 0")
     if tracks.duplicated(["frame", "particle"]).any():
         raise ValueError("tracks: got a particle twice in a frame, allowed is once")
-    if tracks.empty:
-        return tracks.assign(**{f"v{axis}{kind}_um_s": 0.0 for axis in "xyz" for kind in ("", "_std")})
+    if frame_rate_hz is not None:
+        t_s = tracks["frame"].to_numpy() / positive("frame_rate_hz", frame_rate_hz)
+    elif "t_s" in tracks:
+        t_s = check_table("tracks", tracks, ["t_s"])["t_s"].to_numpy(dtype=float)
+    else:
+        raise ValueError("frame_rate_hz: got None, allowed is that if tracks have a column t_s")
+    position = tracks[columns].to_numpy(dtype=float)
+    weight = tracks[stds].to_numpy(dtype=float) ** -2.0 if weighted else np.ones_like(position)
+    fitted, std = _slopes(tracks, t_s, position, weight, window, least=1.0 if weighted else 0.0)
+    made = {}
+    for axis, column in enumerate(columns):
+        name, unit = column.split("_")
+        made[f"v{name}_{unit}_s"], made[f"v{name}_std_{unit}_s"] = fitted[:, axis], std[:, axis]
+    return tracks.assign(**made)
+
+
+def _slopes(
+    tracks: pd.DataFrame, t_s: NDArray, position: NDArray, weight: NDArray, window: int, least: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes of parabolas through positions (n, 3) in a window about each row, and their stds; both (n, 3).
+
+    Variances are those of the weights, enlarged by chi-square over the degrees of freedom, and not below `least` times.
+    """
+    moments, right = np.zeros((5, len(tracks), 3)), np.zeros((3, len(tracks), 3))
+    number, squares = np.zeros(len(tracks)), np.zeros((len(tracks), 3))
     row = pd.factorize(tracks["particle"])[0]
-    column = (tracks["frame"] - tracks["frame"].min()).to_numpy()
-    grid = np.zeros((row.max() + 1, column.max() + 1))
-    offset_s = step_s * np.arange(-(window // 2), window // 2 + 1)
-
-    def moment(values: NDArray, power: int) -> NDArray:
-        """Sum over the window of each row of `tracks` of `values`, of the same rows, times offset ** power."""
-        dense = grid.copy()
-        dense[row, column] = values
-        return correlate1d(dense, offset_s**power, axis=1, mode="constant")[row, column]
-
-    number = np.rint(moment(np.ones(len(tracks)), 0))
-    enough = number >= 5
-    columns = {}
-    for axis in "xyz":
-        weight = tracks[f"{axis}_std_um"].to_numpy() ** -2.0
-        place = tracks[f"{axis}_um"].to_numpy()
-        normal = np.stack([moment(weight, power) for power in range(5)])[np.add.outer(range(3), range(3))]
-        right = np.stack([moment(weight * place, power) for power in range(3)])
-        inverse = np.linalg.inv(np.moveaxis(normal, -1, 0)[enough])
-        fitted = np.einsum("nij,jn->in", inverse, right[:, enough])
-        squares = moment(weight * place**2, 0)[enough] - (fitted * right[:, enough]).sum(axis=0)
-        excess = np.maximum(squares / np.maximum(number[enough] - 3, 1), 1)
-        for name, values in (("", fitted[1]), ("_std", np.sqrt(inverse[:, 1, 1] * excess))):
-            columns[f"v{axis}{name}_um_s"] = np.full(len(tracks), np.nan)
-            columns[f"v{axis}{name}_um_s"][enough] = values
-    return tracks.assign(**columns)
+    column = (tracks["frame"] - tracks["frame"].min()).to_numpy(dtype=int)
+    key = row.astype(np.int64) * (column.max(initial=0) + window) + column  # no other track within a window
+    order = np.argsort(key, kind="stable")
+    for offset in range(-(window // 2), window // 2 + 1):
+        at = np.minimum(np.searchsorted(key[order], key + offset), len(key) - 1)
+        there = np.flatnonzero(key[order][at] == key + offset)
+        other = order[at[there]]
+        dt, dx = (t_s[other] - t_s[there])[:, None], position[other] - position[there]
+        number[there] += 1
+        squares[there] += weight[other] * dx**2
+        for power in range(5):
+            moments[power, there] += weight[other] * dt**power
+            if power < 3:
+                right[power, there] += weight[other] * dt**power * dx
+    enough = number >= LEAST_ROWS
+    normal = np.moveaxis(moments[np.add.outer(range(3), range(3))], (0, 1), (-2, -1))[enough]
+    right = np.moveaxis(right, 0, -1)[enough]
+    inverse = np.linalg.inv(normal)
+    fitted = np.einsum("naij,naj->nai", inverse, right)
+    chi2 = squares[enough] - (fitted * right).sum(axis=-1)
+    excess = np.maximum(chi2 / (number[enough] - 3)[:, None], least)
+    slope, std = np.full((2, *position.shape), np.nan)
+    slope[enough], std[enough] = fitted[..., 1], np.sqrt(inverse[..., 1, 1] * excess)
+    return slope, std
 
 
 # -------------------- against the truth
@@ -256,9 +356,9 @@ def link_scores(
     Returns
     -------
     Series
-        `n_tracks`, `n_links`. Shares of the links: `right`, both ends are the same true particle; `wrong`, they
-        are two; `nobody`, an end is none. `found`, right links over those of the truth (from each particle's frame to
-        its next), so that missed particles count, too. `n_gaps`, links over one or more frames without a
+        `n_tracks`, `n_links`. Fractions of the links: `right`, both ends are the same true particle; `wrong`, they
+        are two; `nobody`, an end is a false find. `found`, right links over those of the truth (from each particle's
+        frame to its next), so that missed particles count, too. `n_gaps`, links over one or more frames without a
         measurement, and `gaps_right`, the fraction of them. `n_particles`, true ones that are in tracks; `broken`,
         the fraction of them that are in more than one; `pieces`, tracks for each. NaN if there are none to divide by.
 
@@ -296,4 +396,5 @@ def link_scores(
 
 
 def _fraction(yes: NDArray[np.bool_] | pd.Series) -> float:
+    """Fraction of what is true in an array (n,); NaN if it is empty."""
     return float(np.mean(yes)) if len(yes) else np.nan
