@@ -30,7 +30,7 @@ def test_found_missed_and_false_are_told_apart() -> None:
     assert second.get_title(loc="left") == "two: 3 found, 0 missed, 0 false"
     np.testing.assert_array_equal(below.images[0].get_array(), left["one"])
     assert below.images[0].get_clim() == (-plots.RESIDUAL_END, plots.RESIDUAL_END)
-    assert bar.get_ylabel() == "left over (noise of a pixel)"
+    assert bar.get_ylabel() == "residual (noise of a pixel)"
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["found", "missed", "false"]
 
 
