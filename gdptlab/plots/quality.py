@@ -23,7 +23,7 @@ from gdptlab.plots.frames import circled
 from gdptlab.plots.style import COLOURS, MARK, bare, depth_label, grey, panels, styled
 
 NUMBERED = 60
-"""Beads of a scan, the brightest, whose numbers are shown."""
+"""Number of beads of a scan whose numbers are shown, the brightest: more would cover each other."""
 
 
 @styled
@@ -178,6 +178,7 @@ def measured_page(frame: NDArray, table: pd.DataFrame, settings: Settings, calib
 
 
 def _cm_histogram(axes: Axes, settings: Settings) -> None:
+    """Draw how C_m is distributed, of particles and of finds that are false for certain."""
     bins = np.arange(0.2, 1.0001, 0.025)
     axes.hist(settings.found["cm"], bins, color=COLOURS[0], alpha=0.8, label="frames as they are")
     none = {"with their sign turned": settings.false, "beside lone particles": settings.side_lobes}
@@ -190,6 +191,7 @@ def _cm_histogram(axes: Axes, settings: Settings) -> None:
 
 
 def _even(axes: Axes, table: pd.DataFrame) -> None:
+    """Draw chi2 against the amplitude of each particle."""
     axes.plot(table["amplitude"], table["chi2"], "o", color=COLOURS[0], ms=4, mew=0, alpha=0.8)
     axes.axhline(1, color="0.6", lw=1, ls=":")
     axes.axvline(table["amplitude"].median(), color="0.6", lw=1, ls=":")
