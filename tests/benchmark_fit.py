@@ -27,7 +27,6 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
 from gdptlab import Calibration, datasets, match
-from gdptlab.autocalibrate import _size as scan_size
 from gdptlab.autocalibrate import find_beads
 from gdptlab.fit import Joint, PatternModel
 from gdptlab.fit.learning import learned
@@ -325,7 +324,7 @@ def model_of_stack(stack: NDArray, z_um: NDArray) -> PatternModel:
 def model_of_scan(scan: NDArray, z_um: NDArray) -> PatternModel:
     """Model of all beads of a scan, found in it."""
     beads = find_beads(scan, z_um)
-    return learned(scan, z_um, beads[["x_px", "y_px"]].to_numpy(), scan_size(scan, beads))[0]
+    return learned(scan, z_um, beads[["x_px", "y_px"]].to_numpy())[0]
 
 
 def joint(frame: NDArray, model: PatternModel, _: pd.DataFrame) -> pd.DataFrame:

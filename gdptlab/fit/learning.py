@@ -20,6 +20,7 @@ from scipy.spatial import KDTree
 from scipy.stats import median_abs_deviation
 from skimage.registration import phase_cross_correlation
 
+from gdptlab.calibration import LARGEST, _image_size
 from gdptlab.check import real_array, whole
 from gdptlab.cores import compiled, on_one_core
 from gdptlab.denoising import noise_level, noise_line
@@ -49,6 +50,9 @@ image is wide it changes slowly, but noise differs from slice to slice and makes
 SLICES = 35
 """Number of slices, evenly spread, from which positions are learned: neighbouring ones say much the same of them."""
 
+SIZE_SLICES = 15
+"""Number of slices, evenly spread, in which the size of the images is sought."""
+
 NOISE_SLICES = 6
 """Number of slices, evenly spread, from whose residual the noise is learned: more than a million pixels."""
 
@@ -76,11 +80,11 @@ def learned(
     scan: ArrayLike,
     z_um: ArrayLike,
     beads_px: ArrayLike,
-    size: int,
     *,
+    size: int | None = None,
     field: bool | None = None,
     modes: int | None = None,
-    turns: int = 4,
+    turns: int = 3,
     learn_from: ArrayLike | None = None,
 ) -> tuple[PatternModel, pd.DataFrame]:
     """Learn the pattern model from a scan.
@@ -93,8 +97,9 @@ def learned(
         Depths, increasing, evenly spaced.
     beads_px : array (P, 2)
         About where the particles are: x, y, px, good to a few pixels.
-    size : int
-        Rows and columns of the widest image, odd.
+    size : int, optional
+        Rows and columns of the widest image, odd; found in the median of the particles' surroundings if not given,
+        in which neighbours do not show.
     field : bool, optional
         Whether the patterns change over the field; if not given, from PARTICLES_FOR_FIELD particles on.
     modes : int, optional
@@ -124,7 +129,8 @@ def learned(
         raise ValueError(f"z_um: got {len(steps) + 1} depths for {len(scan)} frames, needed are as many, 8 or more")
     if steps.min() <= 0 or np.ptp(steps) > 0.1 * steps.mean():
         raise ValueError(f"z_um: got steps from {steps.min():g} to {steps.max():g} µm, allowed are even ones above 0")
-    if whole("size", size, 5, min(scan.shape[1:])) % 2 == 0:
+    size = _median_size(scan, beads_px) if size is None else whole("size", size, 5, min(scan.shape[1:]))
+    if size % 2 == 0:
         raise ValueError(f"size: got {size}, allowed are odd numbers")
     learning = _Learning(scan, beads_px[:, ::-1].astype(float), size // 2, _chosen(scan, beads_px, size, learn_from))
     count = int(learning.chosen.sum())
@@ -162,6 +168,22 @@ def _chosen(scan: NDArray, beads_px: NDArray, size: int, learn_from: ArrayLike |
     return chosen & (np.minimum(beads_px, end - beads_px).min(axis=1) > size / 4)
 
 
+def _median_size(scan: NDArray[np.float32], beads_px: NDArray) -> int:
+    """Size of the widest image of the median particle, at most half of a frame."""
+    half = min(LARGEST // 2, min(scan.shape[1:]) // 4)
+    some = scan[:: max(len(scan) // SIZE_SLICES, 1)] - np.median(scan)
+    cuts = np.stack([_window(some, np.rint(place[::-1]).astype(int), half) for place in beads_px])
+    return max(_image_size(np.median(cuts / np.abs(cuts).max(axis=(1, 2, 3), keepdims=True), axis=0)), 5)
+
+
+def _window(images: NDArray, place: NDArray[np.int64], half: int) -> NDArray:
+    """Part (N, 2 half + 1, 2 half + 1) of images about the pixel `place` (y, x); the edge is repeated beyond it."""
+    rows, columns = (
+        np.clip(np.arange(p - half, p + half + 1), 0, n - 1) for p, n in zip(place, images.shape[1:], strict=True)
+    )
+    return images[:, rows[:, None], columns]
+
+
 class _Learning:
     """A scan (N, rows, columns) and all that is known of it so far.
 
@@ -177,12 +199,13 @@ class _Learning:
         self._background = Background(self.shape, 4 * half)
         self.noise = max(noise_level(scan[:: max(len(scan) // 10, 1)]), 1e-4 * float(np.ptp(scan))) or 1.0
         self.line = np.array([0, self.noise**2])
+        self.levels = np.median(scan[:, ::4, ::4], axis=(1, 2))
 
     def begin(self, terms: int) -> None:
         """First amplitudes and heights, from the particles' small surroundings, and empty patterns."""
         near = max(self.half // 3, 2)
         cuts = np.stack([self._cut(self.scan, i, near) for i in range(len(self.places))])
-        cuts -= np.median(self.scan, axis=(1, 2))[:, None, None]
+        cuts -= self.levels[:, None, None]
         typical = np.median(cuts[self.chosen] / np.abs(cuts[self.chosen]).max(axis=(1, 2, 3), keepdims=True), axis=0)
         peak = np.abs(typical).max(axis=(1, 2))
         inside = (np.abs(typical) > peak[:, None, None] / 2).sum(axis=(1, 2))
@@ -199,12 +222,8 @@ class _Learning:
         self.modes = np.zeros((0, len(self.scan), m, m), np.float32)
 
     def _cut(self, images: NDArray, i: int, half: int) -> NDArray:
-        """Part (N, 2 half + 1, 2 half + 1) of images about particle i, the edge repeated beyond the border."""
-        y, x = np.rint(self.places[i, :2]).astype(int)
-        rows, columns = (
-            np.clip(np.arange(p - half, p + half + 1), 0, n - 1) for p, n in zip((y, x), self.shape, strict=True)
-        )
-        return images[:, rows[:, None], columns]
+        """Part of images (N, rows, columns) about particle i."""
+        return _window(images, np.rint(self.places[i, :2]).astype(int), half)
 
     def _bring_to_surface(self) -> None:
         """Focal surface through the heights, which no outlier pulls; a height far off it is brought back."""
@@ -228,15 +247,16 @@ class _Learning:
         columns = renderer.draw(places, self.shape, self.heights, by_mode=by_mode)
         light = np.zeros(self.shape, np.float32)
         columns.add_to(light, places[:, 3])
-        rest = self.scan[k] - light
-        weight = self._weight(light, np.median(rest))
-        background = self._background.fit(rest, weight)
-        return columns, rest - background, self._weight(light, background), light + background
+        weight = self._weight(light + self.levels[k], light)
+        background = self._background.fit(self.scan[k] - light, weight)
+        self.levels[k] = background.mean()
+        return columns, self.scan[k] - light - background, weight, light + background
 
-    def _weight(self, light: NDArray[np.float32], background: NDArray[np.float32] | float) -> NDArray[np.float32]:
+    def _weight(self, model: NDArray[np.float32], light: NDArray[np.float32]) -> NDArray[np.float32]:
         """One over the variance of each pixel: of its noise and of the patterns' own error."""
-        variance = np.maximum(np.polyval(self.line, light + background), self.noise**2 / 4) + (MISFIT * light) ** 2
-        return (1 / variance).astype(np.float32)
+        slope, intercept = self.line.astype(np.float32)
+        variance = np.maximum(intercept + slope * model, np.float32(self.noise**2 / 4))
+        return 1 / (variance + np.square(np.float32(MISFIT) * light))
 
     def _residual(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Residual of all slices and its weight; what there is of photon noise is learned on the way."""
