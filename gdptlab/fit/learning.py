@@ -50,6 +50,9 @@ image is wide it changes slowly, but noise differs from slice to slice and makes
 SLICES = 35
 """Number of slices, evenly spread, from which positions are learned: neighbouring ones say much the same of them."""
 
+FIRST_STEPS = 2
+"""Gauss-Newton steps of the positions in each turn before modes are learned: positions may be off by pixels then."""
+
 SIZE_SLICES = 15
 """Number of slices, evenly spread, in which the size of the images is sought."""
 
@@ -145,11 +148,12 @@ def learned(
     learning.begin(4 if field else 1)
     for turn in range(turns):
         learning.learn_patterns(first=turn == 0)
-        learning.learn_places()
+        for _ in range(FIRST_STEPS):
+            learning.learn_places()
     learning.centre()
     if modes:
         learning.begin_modes(modes)
-    for _ in range(turns if modes else 1):
+    for _ in range(turns):
         learning.learn_patterns()
         learning.learn_coefficients()
         learning.learn_places()
@@ -208,8 +212,10 @@ class _Learning:
         cuts -= self.levels[:, None, None]
         typical = np.median(cuts[self.chosen] / np.abs(cuts[self.chosen]).max(axis=(1, 2, 3), keepdims=True), axis=0)
         peak = np.abs(typical).max(axis=(1, 2))
-        inside = (np.abs(typical) > peak[:, None, None] / 2).sum(axis=(1, 2))
-        self.fine = 2 if np.sqrt(inside[peak > 0.7 * peak.max()].min() / np.pi) < SHARP_PX else 1
+        bright = np.abs(cuts[self.chosen])
+        inside = (bright > bright.max(axis=(2, 3), keepdims=True) / 2).sum(axis=(2, 3))
+        radius = np.sqrt(np.median(inside, axis=0)[peak > 0.5 * peak.max()].min() / np.pi)
+        self.fine = 2 if radius < SHARP_PX else 1
         self.middle = float((peak**4 @ np.arange(len(peak))) / (peak**4).sum())
         amplitude = np.einsum("pkij,kij->p", cuts, typical)
         self.places[:, 3] = np.maximum(amplitude / np.median(amplitude[self.chosen]), 0.02)
