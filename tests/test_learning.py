@@ -43,8 +43,8 @@ def beads_of(rng, n, apart_px=16.0):
     return table(*np.array(places).T, 0.0 * np.ones(n)).assign(amplitude=np.exp(rng.uniform(-1.1, 1.1, n)))
 
 
-def about(beads, rng, px=0.7):
-    """Positions that are good to a pixel."""
+def about(beads, rng, px=0.25):
+    """Positions that are good to a fraction of an image, as those of spots found in the sharpest slice."""
     return beads[["x_px", "y_px"]].to_numpy() + rng.normal(0, px, (len(beads), 2))
 
 
@@ -63,7 +63,7 @@ def wide():
     rng = np.random.default_rng(2)
     beads = beads_of(rng, 24, 22).assign(larger=rng.normal(1, 0.1, 24))
     scan = scan_of(beads, rng, surface_um=np.zeros(4), astigmatism_um=6, width_px=3.0)
-    return beads, scan, *learned(scan, Z_UM, about(beads, rng), field=False, modes=1)
+    return beads, scan, *learned(scan, Z_UM, about(beads, rng, 0.7), field=False, modes=1)
 
 
 @pytest.mark.parametrize("kind", ["sharp", "wide"])

@@ -41,7 +41,7 @@ pattern. Chosen, between 0.05 and 2, by learning from half of a real scan's part
 its slices."""
 
 BELIEVED = 1.0
-"""Slices by which a particle's height may differ from the focal surface."""
+"""Slices by which a particle's height may differ from the focal surface until modes tell how particles differ."""
 
 SMOOTH = (1.0, 0.08)
 """Slices over which patterns are smoothed along z: at least, and as a fraction of the distance from focus. Where an
@@ -147,7 +147,7 @@ def learned(
         )
     learning.begin(4 if field else 1)
     for turn in range(turns):
-        learning.learn_patterns(first=turn == 0)
+        learning.learn_patterns(first=turn == 0, symmetric=True)
         for _ in range(FIRST_STEPS):
             learning.learn_places()
     learning.centre()
@@ -202,7 +202,7 @@ class _Learning:
         self.places = np.pad(places[self._order], ((0, 0), (0, 2)))
         self._background = Background(self.shape, 4 * half)
         self.noise = max(noise_level(scan[:: max(len(scan) // 10, 1)]), 1e-4 * float(np.ptp(scan))) or 1.0
-        self.line = np.array([0, self.noise**2])
+        self.line, self.believed = np.array([0, self.noise**2]), BELIEVED
         self.levels = np.median(scan[:, ::4, ::4], axis=(1, 2))
 
     def begin(self, terms: int) -> None:
@@ -238,7 +238,8 @@ class _Learning:
             surface = np.linalg.lstsq(terms * trust[:, None], heights * trust, rcond=None)[0]
             trust = 1 / np.sqrt(np.maximum(1, np.abs(heights - terms @ surface) / 0.3))
         self.surface = np.pad(surface, (0, 4 - len(surface)))
-        self.heights = np.clip(self.heights, self.terms @ surface - BELIEVED, self.terms @ surface + BELIEVED)
+        smooth = self.terms @ surface
+        self.heights = np.clip(self.heights, smooth - self.believed, smooth + self.believed)
 
     def _renderer(self) -> Renderer:
         modes = self.modes if len(self.modes) else None
@@ -277,10 +278,12 @@ class _Learning:
 
     # ---------------- patterns
 
-    def learn_patterns(self, *, first: bool = False) -> None:
+    def learn_patterns(self, *, first: bool = False, symmetric: bool = False) -> None:
         """Add to the patterns, and to the modes, the residual around the particles.
 
-        In the `first` turn nobody's neighbours are known yet, and only particles without near ones are used.
+        In the `first` turn nobody's neighbours are known yet, and only particles without near ones are used. While
+        positions are rough, a mean pattern that is not `symmetric` under half a turn would keep them where they are:
+        it has a part for each bright particle that is off.
         """
         rest, weight = self._residual()
         chosen, count = self.chosen, self.terms.shape[1]
@@ -297,6 +300,29 @@ class _Learning:
             change[zone] = both[:count]
             self.modes[zone] = _along(smoother[slices][:, slices], self.modes[zone] + both[count:])
         self.patterns = _along(smoother, self.patterns + change)
+        if symmetric:
+            self.patterns[0] = (self.patterns[0] + self.patterns[0, :, ::-1, ::-1]) / 2
+        self._settle()
+
+    def _settle(self) -> None:
+        """Give back to positions and heights what the patterns' changes over the field, and the modes, took from them.
+
+        A change in proportion to the mean pattern's slope along x, say, draws particles aside that have another
+        position in truth. Heights keep what the modes tell of them: all particles of the scan are on one plane.
+        """
+        y, x, z = (-np.gradient(self.patterns[0], axis=axis) for axis in (1, 2, 0))
+        slopes = self.fine * y, self.fine * x, z
+        for slope, of in zip(slopes, (0, 1, None), strict=True):
+            power = float(np.vdot(slope, slope)) or 1.0
+            moved = np.array([np.vdot(slope, pattern) / power for pattern in self.patterns[1:]])
+            self.patterns[1:] -= moved.astype(np.float32)[:, None, None, None] * slope
+            shift_ = self.terms[:, 1:] @ moved
+            if of is None:
+                self.heights += shift_
+                continue
+            told = np.array([np.vdot(slope, mode) / power for mode in self.modes])
+            self.modes -= told.astype(np.float32)[:, None, None, None] * slope
+            self.places[:, of] += shift_ + self.places[:, 4:] @ told
 
     def _regressed(
         self,
@@ -376,7 +402,13 @@ class _Learning:
         return slices, half, np.s_[:, slices[0] : slices[-1] + 1, nodes, nodes]
 
     def begin_modes(self, count: int) -> None:
-        """Coefficients of the modes: principal components of the residual around the particles."""
+        """Coefficients of the modes: principal components of the residual around the particles.
+
+        From here on all particles are in focus on the focal surface, as those of a scan lie on a plane: how high one
+        seems to be beside it is part of how it differs. A larger one seems to be farther away.
+        """
+        self.believed = 0.0
+        self._bring_to_surface()
         (slices, half, zone), (rest, _), margin, around = self._zone(), self._residual(), 3, []
         for i, (place, height) in enumerate(zip(self.places, self.heights, strict=True)):
             low = np.clip(slices + int(np.floor(height)), 0, len(rest) - 2)
