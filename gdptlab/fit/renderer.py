@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter, spline_filter1d
 
 from gdptlab.cores import compiled, inlined
-from gdptlab.fit.model import PatternModel, field_terms
+from gdptlab.fit.model import field_terms
 from gdptlab.fit.threads import in_parts
 
 FAINT = 0.35
@@ -256,7 +256,9 @@ def _spline(f):  # pragma: no cover
 
 
 @compiled
-def _draw(nodes, factors, terms, differ, places, slices, first, end, boxes, starts, values, scratch):  # pragma: no cover
+def _draw(
+    nodes, factors, terms, differ, places, slices, first, end, boxes, starts, values, scratch
+):  # pragma: no cover
     """Fill `values` of particles `first` to `end`: along z over the nodes of the support, then x, then y.
 
     Nodes are handled by phase, and those of one phase of rows and columns as one long line, a row after the other.

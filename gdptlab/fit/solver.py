@@ -106,7 +106,7 @@ class Fit:
 
     @property
     def energy(self) -> NDArray[np.float64]:
-        """Weighted squares of each particle's pattern, (P,): what the frame would tell of its amplitude were it alone."""
+        """Weighted squares of each particle's pattern, (P,): one over the variance of its amplitude were it alone."""
         return self._in_order(self._system.alone)
 
     @cached_property
