@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from test_particle_images import crowd, dense
+from test_renderer import crowd, dense
 
-from gdptlab.background import BOUNDED, Background
-from gdptlab.particle_images import ParticleImages
+from gdptlab.fit.background import BOUNDED, Background, suitable
+from gdptlab.fit.renderer import Renderer
 
 SHAPE, KNOT_PX, NOISE = (200, 260), 60.0, 10.0
 COEFFICIENTS = 6 * 7  # round(side / knot) + 3 in each direction
@@ -92,6 +92,18 @@ def test_frame_is_not_changed(surface):
     np.testing.assert_array_equal((frame, weight), kept)
 
 
+@pytest.mark.parametrize(("period", "chosen"), [(None, 0), (600, 0), (60, 2)])
+def test_knots_suit_the_frame(period, chosen):
+    """Coarse ones unless the background changes faster than they follow; particles not found yet change nothing."""
+    rng, x = np.random.default_rng(9), np.arange(SHAPE[1])
+    frame = noisy(9) + (400 * np.sin(2 * np.pi * x / period) if period else 0)
+    for _ in range(12):
+        y, x = (rng.integers(10, side - 10) for side in SHAPE)
+        frame[y - 6 : y + 7, x - 6 : x + 7] += 800
+    surfaces = [Background(SHAPE, knot) for knot in (120.0, 60.0, 15.0)]
+    assert suitable(surfaces, frame.astype(np.float32), uniform(), 4.0) == chosen
+
+
 # -------------------- sums
 
 
@@ -121,7 +133,7 @@ def test_matrix_and_gradient_are_dense_products(surface, sums):
 @pytest.mark.parametrize("seed", range(3))
 def test_products_with_particles_are_dense_products(surface, sums, clean_stack, seed):
     splines, weight, _ = sums
-    columns = ParticleImages(clean_stack - 500.0, 38).draw(crowd(SHAPE, 40, seed, margin=30), SHAPE)
+    columns = Renderer((clean_stack - 500.0)[None], 1, noise=38).draw(crowd(SHAPE, 40, seed, margin=30), SHAPE)
     root = np.sqrt(weight.ravel())[:, None]
     images, splines = root * dense(columns, SHAPE), root * splines
     seen = np.linalg.norm(images, axis=0) > 0

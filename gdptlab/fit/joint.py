@@ -131,14 +131,15 @@ class Joint:
     def __init__(self, model: PatternModel, shape: tuple[int, int], threads: int = 1) -> None:
         self.model, self.shape = model, shape
         self._peak = np.float32(model.peak.max())
-        fine, scale = model.nodes_per_px, 2
+        fine, scale = model.nodes_per_px, 2 if model.half_resolution else 1
         self._scale, self._small_shape = scale, tuple(-(-n // scale) for n in shape)
         patterns, error = model.patterns / self._peak, model.pattern_error / self._peak
         modes = None if model.modes is None else model.modes / self._peak
         self._full = self._level(patterns, error, 1, threads, modes)
-        half = reduced(patterns, fine)
-        inner = slice(_even(error), error.shape[-1] - _even(error), 2)
-        error = np.ascontiguousarray(error[:, inner, inner]) / scale
+        half = patterns
+        if scale == 2:
+            half, inner = reduced(patterns, fine), slice(_even(error), error.shape[-1] - _even(error), 2)
+            error = np.ascontiguousarray(error[:, inner, inner]) / scale
         self._small = self._level(half, error, scale, threads)
         self._blur = BLUR * model.size / scale
         self._sharp = self._level(high_passed(half, self._blur * fine), error, scale, threads)
@@ -253,8 +254,12 @@ class Joint:
         self, fit: Fit, weight: NDArray[np.float32], total: NDArray[np.float32], population: Population
     ) -> NDArray[np.float64]:
         """Places of further particles, at full resolution; some may lie outside the frame."""
-        left = cv2.pyrDown(fit.residual * np.sqrt(weight / (1 + weight * total)))
+        left = self.reduced(fit.residual * np.sqrt(weight / (1 + weight * total)))
         return self._new(left, population, fit.places.shape[1], whiten=False, outside_px=self.model.size / 4)
+
+    def reduced(self, frame: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A frame at the resolution of the search."""
+        return cv2.pyrDown(frame) if self._scale == 2 else frame
 
     def _new(
         self,
@@ -365,9 +370,9 @@ class _Search:
 
     def __init__(self, joint: Joint, frame: NDArray[np.float32], pixels: Pixels) -> None:
         self._joint, scale = joint, joint._scale
-        self._frame = cv2.pyrDown(frame)
+        self._frame = joint.reduced(frame)
         self._sharp_frame = high_passed(self._frame[None], joint._blur)[0]
-        valid = True if pixels.valid.all() else cv2.pyrDown(pixels.valid.astype(np.float32)) > 0.9
+        valid = True if pixels.valid.all() else joint.reduced(pixels.valid.astype(np.float32)) > 0.9
         self._weight = np.full(self._frame.shape, scale**2, np.float32) * valid
         self._scale = scale
         self.places, self.population = np.zeros((0, 4)), None

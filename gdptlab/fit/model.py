@@ -12,15 +12,20 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, median_filter
 
 from gdptlab.calibration import Calibration
+from gdptlab.correlation import normalised
 from gdptlab.denoising import denoised, noise_level
 
 ALIKE = 0.85
 """Correlation of the patterns at two depths from which on the one may be taken for the other."""
+
+LOSSLESS = 0.98
+"""Patterns that keep this correlation with themselves at half resolution are sought there."""
 
 ERROR_SCALE_PX = 2.0
 """Scale, in px, on which the error of the patterns is compared with white noise; about the width of their finest
@@ -116,6 +121,16 @@ class PatternModel:
     def peak(self) -> NDArray[np.float64]:
         """Largest deviation of the mean pattern from the background at each slice, counts at amplitude 1, (N,)."""
         return np.abs(gaussian_filter(self.images, (0, 1, 1))).max(axis=(1, 2)).astype(float)
+
+    @cached_property
+    def half_resolution(self) -> bool:
+        """Whether particles can be sought at half resolution: their images are hardly changed by it."""
+        trim = self.images.shape[-1] // 2 % 2
+        images = np.ascontiguousarray(
+            self.images[:, trim : len(self.images[0]) - trim, trim : len(self.images[0]) - trim]
+        )
+        restored = np.stack([cv2.pyrUp(cv2.pyrDown(image))[: image.shape[0], : image.shape[1]] for image in images])
+        return bool(np.einsum("kij,kij->k", normalised(restored), normalised(images)).min() >= LOSSLESS)
 
     @cached_property
     def twin(self) -> NDArray[np.float64]:

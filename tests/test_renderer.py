@@ -5,8 +5,9 @@ import pytest
 from conftest import SIZE_PX, Z_UM, table
 from scipy.interpolate import BSpline
 
+from gdptlab.fit.model import field_terms
+from gdptlab.fit.renderer import Renderer, along_z, draw_error, energy_beside_errors
 from gdptlab.imagetypes import Camera
-from gdptlab.particle_images import ParticleImages, along_z
 
 HALF = SIZE_PX // 2
 NOISE = Camera().read_noise
@@ -24,7 +25,7 @@ def images(clean_stack):
 
 @pytest.fixture(scope="module")
 def shapes(images):
-    return ParticleImages(images, NOISE)
+    return Renderer(images[None], 1, noise=NOISE)
 
 
 def drawn(shapes, places, shape):
@@ -68,7 +69,7 @@ def test_images_themselves_come_back(shapes, images, k):
 
 
 def test_what_a_box_leaves_out_is_faint(shapes, images):
-    for k, (down, across) in enumerate(shapes.reach):
+    for k, (down, across) in enumerate(shapes.support[0]):
         rest = images[k].copy()
         rest[HALF - down : HALF + down + 1, HALF - across : HALF + across + 1] = 0
         assert np.abs(rest).max() < 2 * NOISE
@@ -76,7 +77,7 @@ def test_what_a_box_leaves_out_is_faint(shapes, images):
 
 
 def test_the_less_noise_the_farther_images_reach(images):
-    reach = [ParticleImages(images, noise).reach for noise in (1.0, 38.0, 300.0)]
+    reach = [Renderer(images[None], 1, noise=noise).support[0] for noise in (1.0, 38.0, 300.0)]
     assert (reach[0] >= reach[1]).all() and (reach[1] >= reach[2]).all()
     assert reach[0].mean() > reach[1].mean() > reach[2].mean()
     assert reach[0].max() <= HALF
@@ -96,9 +97,9 @@ def test_drawn_like_the_microscope_renders(shapes, microscope, seed, aligned):
         assert frame.sum() == pytest.approx(light[seen].sum(), rel=0.01)
 
 
-def test_brightness_is_a_factor(shapes):
-    one, other = (drawn(shapes, np.array([[40.3, 50.8, 20.4, b]]), (90, 100)) for b in (1.0, 2.5))
-    np.testing.assert_allclose(other, 2.5 * one, rtol=1e-5)
+def test_amplitude_is_a_factor(shapes):
+    one, other = (drawn(shapes, np.array([[40.3, 50.8, 20.4, a]]), (90, 100)) for a in (1.1, 1.9))
+    np.testing.assert_allclose(other, 1.9 / 1.1 * one, rtol=1e-5)
 
 
 @pytest.mark.parametrize("axis", range(4))
@@ -204,3 +205,97 @@ def test_spline_along_z_follows_a_cubic_to_its_ends(count, degree):
     coefficients = along_z(cubic(steps)[:, None])[:, 0]
     assert len(coefficients) == count + 2
     np.testing.assert_allclose(BSpline(np.arange(count + 6) - 3.0, coefficients, 3)(fine), cubic(fine), atol=1e-9)
+
+
+# -------------------- patterns over the field, modes, threads, errors
+
+
+def field_renderer(fine, half=12, count=9):
+    """Smooth patterns with four terms, a focal surface, and two modes that begin at slice 2 and end at 6."""
+    rng, m = np.random.default_rng(10), 2 * fine * half + 1
+    y, x = (np.indices((m, m)) - m // 2) / fine
+    rim = np.maximum(1 - (x**2 + y**2) / (half - 1) ** 2, 0) ** 2
+
+    def smooth(n):
+        a, b, c = rng.uniform(0.2, 0.5, (3, n, count, 1, 1))
+        return rim * np.cos(a * x + b * y + 3 * c + 0.3 * np.arange(count)[:, None, None])
+
+    modes = smooth(2)
+    modes[:, :2], modes[:, 7:] = 0, 0
+    surface = np.array([0.1, 0.6, -0.4, 0.3])
+    patterns = smooth(4)
+    return Renderer(patterns, fine, noise=1e-3, surface=surface, modes=modes), surface, patterns, modes
+
+
+@pytest.mark.parametrize("fine", [1, 2])
+@pytest.mark.parametrize("axis", range(6))
+def test_derivatives_over_the_field(fine, axis):
+    """By y, x, slice, amplitude and modes; the terms of the field are constant over an image."""
+    renderer = field_renderer(fine)[0]
+    shape, h = (4000, 5000), 0.01
+    for place in ([1502.3, 2100.8, 3.3, 1.2, 0.5, -0.3], [2100.7, 900.2, 5.6, 0.8, -1.0, 0.4]):
+        place = np.array([place])
+        step = np.zeros(6)
+        step[axis] = h
+        columns = renderer.draw(place, shape, by_mode=True)
+        up, down = (renderer.draw(place + s * step, shape, by_mode=True) for s in (1, -1))
+        np.testing.assert_array_equal(up.boxes, columns.boxes)
+        up, down = (c.values[3] * (place[0, 3] + s * step[3]) for c, s in ((up, 1), (down, -1)))
+        difference = (up.astype(float) - down) / (2 * h)
+        assert np.abs(difference).max() > 0.01
+        assert np.abs(difference - columns.values[axis]).max() < 0.01 * np.abs(difference).max()
+
+
+@pytest.mark.parametrize("fine", [1, 2])
+def test_nodes_come_back_as_the_formula_says(fine):
+    """At a whole pixel and slice: patterns weighted with the terms, plus modes."""
+    renderer, surface, patterns, modes = field_renderer(fine)
+    shape, (y, x), half = (90, 120), (40, 70), 12
+    terms = field_terms(x, y, shape)
+    place = np.array([[y, x, 4 + terms @ surface, 1.0, 0.7, -1.3]])
+    expected = np.einsum("m,mij->ij", terms, patterns[:, 4]) + np.einsum("k,kij->ij", place[0, 4:], modes[:, 4])
+    y0, y1, x0, x1 = renderer.draw(place, shape).boxes[0]
+    inside = np.s_[y0 - y + half : y1 - y + half, x0 - x + half : x1 - x + half]
+    np.testing.assert_allclose(drawn(renderer, place, shape)[y0:y1, x0:x1], expected[::fine, ::fine][inside], atol=1e-5)
+
+
+def test_threads_change_nothing(images):
+    """To the last bit: image, matrix, right-hand side."""
+    places, rng = crowd((200, 300), 60, 12, margin=20), np.random.default_rng(13)
+    weight, residual = rng.random((2, 200, 300)).astype(np.float32)
+    one, two = (Renderer(images[None], 1, noise=NOISE, threads=n).draw(places, (200, 300)) for n in (1, 2))
+    np.testing.assert_array_equal(one.values, two.values)
+    np.testing.assert_array_equal(one.matrix(weight), two.matrix(weight))
+    np.testing.assert_array_equal(one.gradient(residual, weight)[0], two.gradient(residual, weight)[0])
+    frames = np.zeros((2, 200, 300), np.float32)
+    for columns, frame in zip((one, two), frames, strict=True):
+        columns.add_to(frame, places[:, 3])
+    np.testing.assert_array_equal(*frames)
+
+
+def test_brighter_particles_reach_farther(shapes):
+    support = shapes.support
+    assert (np.diff(support, axis=0) >= 0).all() and (support[4] > support[0]).mean() > 0.5
+
+
+def test_errors_of_patterns_and_what_they_leave_of_others(shapes, images):
+    """The variance is the square of amplitude and error; a particle's own error takes nothing from it."""
+    error = np.full(images.shape, 7.0, np.float32)
+    places = np.array([[60, 50, 20, 2.0], [63, 66, 24, 0.5], [60, 180, 24, 1.0]])
+    columns, shape = shapes.draw(places, (120, 240)), (120, 240)
+    total = draw_error(error, 1, places, columns.boxes, places[:, 2], shape)
+    y0, y1, x0, x1 = columns.boxes[0]
+    only = np.zeros(shape, bool)
+    only[y0:y1, x0:x1] = True
+    y0, y1, x0, x1 = columns.boxes[1]
+    both = np.zeros(shape, bool)
+    both[y0:y1, x0:x1] = True
+    np.testing.assert_allclose(total[only & ~both], 14.0**2, rtol=1e-5)
+    np.testing.assert_allclose(total[only & both], 14.0**2 + 3.5**2, rtol=1e-5)
+    assert (only & both).any() and (only & ~both).any()
+    weight = np.full(shape, NOISE**-2, np.float32)
+    sure = energy_beside_errors(columns, error, 1, places, places[:, 2], weight, total)
+    alone = np.add.reduceat(columns.values[3] ** 2, columns.starts[:-1])
+    assert sure[2] == pytest.approx(alone[2] / NOISE**2, rel=1e-3)
+    assert 0.3 * alone[1] < sure[1] * NOISE**2 < 0.97 * alone[1]
+    assert sure[0] * NOISE**2 > 0.98 * alone[0]
