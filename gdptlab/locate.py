@@ -14,7 +14,7 @@ By correlation (the paper's section 2):
 6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
 
 A particle is then measured only if its whole window lies in the frame; nothing is said of a border half a
-template wide. Or jointly (`overlap`): particles may overlap and be cut by the frame's edge.
+template wide. Or jointly (`fit`): particles may overlap and be cut by the frame's edge.
 """
 
 from collections.abc import Container, Iterable, Iterator
@@ -65,8 +65,8 @@ def locate(
         Any real type, no smaller than a template.
     calibration : Calibration
     method : str
-        "correlation", or "joint": all particles fitted at once, for those that overlap. That is slower, and
-        it takes the particles to be about equally bright. It finds its own threshold, from the noise.
+        "correlation", or "joint": all particles fitted at once, for those that overlap. That is slower. It finds
+        its own threshold, from the noise, and how far amplitudes differ.
     threshold : float
         Of "correlation", as are the next two. Lowest C_m of a particle, above 0, at most 1.
     refine : bool
@@ -80,11 +80,7 @@ def locate(
         A row for each particle, highest C_m first. `x_px` to the right and `y_px` down, the first pixel's
         centre at (0, 0); `z_um` in the depths of the calibration; `cm`, the correlation with the best image;
         `at_end`, whether that is the stack's first or last image, so that z may lie beyond it. With
-        "joint" `z_um` is less `Calibration.own_bias_um`, and there are also `x_std_px`, `y_std_px` and `z_std_um`,
-        standard deviations (noise of the frame and of the calibration, neighbours considered; wider for a
-        particle unlike the others in brightness); `brightness`, 1 for that of the calibration's particle; and
-        `chi2`, the mean square of what is left around the particle, in units of the noise: well above 1 for
-        what is no particle of this kind.
+        "joint" there are more columns, and counts of what was left out in `attrs` (see `fit.Joint.table`).
 
     Raises
     ------

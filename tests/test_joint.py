@@ -3,16 +3,19 @@
 Particles lie anywhere in the frame, at any depth; noise is in calibrations and frames; seeds are conftest's and here.
 """
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
 from conftest import CALIBRATION_SEED, IMAGE_TYPES, SIZE_PX, Z_UM, on_grid, table
 
-from gdptlab import Calibration, batch, locate, match
+from gdptlab import Calibration, Microscope, batch, locate, match
 from gdptlab.assess import scores
 from gdptlab.film import Film
+from gdptlab.fit import Joint, decided_by_plane
+from gdptlab.fit.joint import high_passed, reduced
+from gdptlab.fit.model import continued
 from gdptlab.imagetypes import Camera
-from gdptlab.overlap import STAGES, Overlap, _brightness, _continued, _high_passed, _variance, _weight
 
 ERRORS, STD = ["dx_px", "dy_px", "dz_um"], ["x_std_px", "y_std_px", "z_std_um"]
 # 50 and 150 in 512 by 512 px.
@@ -52,7 +55,7 @@ def test_random_positions(microscope, calibrations, kind, n):
         tables.append(true.assign(frame=frame))
     measured, true = (pd.concat(t, ignore_index=True) for t in (frames, tables))
     assert_found(scores(measured, true), n)
-    assert measured["brightness"].median() == pytest.approx(1, abs=0.02)
+    assert measured["amplitude"].median() == pytest.approx(1, abs=0.02)
     assert 0.8 < measured["chi2"].median() < 1.4
     assert (measured["cm"].groupby(measured["frame"]).diff().dropna() <= 0).all()
 
@@ -126,7 +129,7 @@ def test_scattered_brightness(microscope, calibration, crowd):
     measured = joint(microscope.render(true, rng=rng), calibration)
     assert_found(scores(measured, true))
     pairs = match(measured, true)
-    bright = measured.loc[pairs["measured"], "brightness"].to_numpy()
+    bright = measured.loc[pairs["measured"], "amplitude"].to_numpy()
     assert np.corrcoef(bright, true.loc[pairs["true"], "brightness"])[0, 1] > 0.7
 
 
@@ -136,7 +139,7 @@ def test_other_illumination(microscope, calibration, crowd, illumination):
     frame = microscope.render(true.assign(brightness=illumination), rng=241)
     measured = joint(frame, calibration)
     assert_found(scores(measured, true), errors=1 / min(illumination, 1))
-    assert measured["brightness"].median() == pytest.approx(illumination, rel=0.03)
+    assert measured["amplitude"].median() == pytest.approx(illumination, rel=0.03)
 
 
 @pytest.mark.parametrize("noisy_stack", [False, True])
@@ -230,7 +233,7 @@ def test_small_sharp_images(size):
     rng, z_um = np.random.default_rng(250), np.linspace(-50, 50, 41)
     stack = [sharp(table(size // 2, size // 2, z), (size, size), rng) for z in z_um]
     made = Calibration.from_stack(stack, z_um)
-    assert not made.half_resolution
+    assert not made.model.half_resolution
     true = anywhere(rng, 40, (150, 180))
     measured = joint(sharp(true, (150, 180), rng), made)
     found, pairs = scores(measured, true), match(measured, true)
@@ -277,7 +280,7 @@ def test_frames_that_do_not_follow_each_other(microscope, calibration):
 
 def test_following_frames_begin_with_the_last(microscope, calibration):
     """One that appears is in the next table; one that leaves is gone; one that moves is followed."""
-    plan, rng = Overlap(calibration, (200, 260)), np.random.default_rng(263)
+    plan, rng = Joint(calibration.model, (200, 260)), np.random.default_rng(263)
     x, y, z = np.array([50.0, 120, 200, 100]), np.array([60.0, 140, 60, 60]), np.array([-30.0, 0, 25, 10])
     seen, explained = [], None
     for k in range(6):
@@ -327,46 +330,8 @@ def test_an_odd_brightness_widens_error_bars(microscope, calibration):
 # -------------------- parts
 
 
-@pytest.mark.parametrize("wrong", [0.0, 0.2])
-def test_noise_is_learnt_from_what_is_left(wrong):
-    """Read noise and photon noise, and not what is wrong with the images, which grows with the square of the light."""
-    rng = np.random.default_rng(270)
-    light = np.zeros((900, 900), np.float32)
-    light[100:820, 50:780] = rng.gamma(2, 300, (720, 730))
-    variance = 38.0**2 + 2 * light
-    residual = (rng.normal(size=light.shape) * np.sqrt(variance + (wrong * light) ** 2)).astype(np.float32)
-    learnt = _variance(light, residual, 38.0)
-    at = np.array([0.0, 300, 1000, 2000])
-    np.testing.assert_allclose(np.polyval(learnt, at), 38.0**2 + 2 * at, rtol=0.25 if wrong == 0 else 0.7)
-    weight = _weight(light, learnt)
-    within = 1.25 if wrong == 0 else 2
-    assert 1 / within < np.median((weight * variance)[light > 0]) < within
-    assert (weight > 0).all() and np.isfinite(weight).all()
-
-
-@pytest.mark.parametrize("lit", [0, 1, 3, 30, 300])
-def test_noise_of_a_frame_with_little_light(lit):
-    """Too few pixels to learn from; no warning."""
-    light = np.zeros((100, 100), np.float32)
-    light.flat[:lit] = 500
-    residual = np.random.default_rng(271).normal(0, 38, light.shape).astype(np.float32)
-    assert _variance(light, residual, 38.0)[-1] == pytest.approx(38.0**2, rel=0.2)
-    assert np.isfinite(_weight(light, _variance(light, residual, 38.0))).all()
-
-
-def test_brightness_of_many_and_few():
-    """Median and scatter; of few, the scatter is not known, and of none, nothing new."""
-    places = np.ones((400, 4))
-    places[:, 3] = np.random.default_rng(272).normal(2, 0.2, 400)
-    middle, spread = _brightness(places, 1.0, 0.5)
-    assert middle == pytest.approx(2, abs=0.05) and spread == pytest.approx(0.2, rel=0.15)
-    assert _brightness(places[:0], 1.0, 0.5) == (1.0, 0.5)
-    alike = np.ones((100, 4))
-    assert _brightness(alike[:1], 1.0, 0.5)[1] > _brightness(alike, 1.0, 0.5)[1] > 0
-
-
 def test_images_go_on_beyond_their_frame(calibration):
-    images = _continued(calibration.images)
+    images = continued(calibration.images)
     more = (images.shape[1] - SIZE_PX) // 2
     assert more > 0 and images.shape[1] % 2 == 1
     np.testing.assert_array_equal(images[:, more:-more, more:-more], calibration.images)
@@ -378,7 +343,7 @@ def test_images_go_on_beyond_their_frame(calibration):
 def test_light_beyond_the_frame_is_about_what_was_cut_off(microscope):
     """At the far end a tenth of a particle's light falls outside of a template."""
     whole = np.stack([microscope.light(table(60, 60, z), (121, 121)) for z in Z_UM]).astype(np.float32)
-    images = _continued(whole[:, 30:-30, 30:-30])
+    images = continued(whole[:, 30:-30, 30:-30])
     total, cut, drawn = (a.sum(axis=(1, 2)) for a in (whole, whole[:, 30:-30, 30:-30], images))
     assert (total / cut)[-1] > 1.1
     np.testing.assert_allclose(drawn / total, 1, atol=0.02)
@@ -388,8 +353,124 @@ def test_high_pass_takes_out_what_is_smooth():
     x = np.indices((80, 90))[1]
     smooth = (500 + 3 * np.sin(x / 60)).astype(np.float32)
     fine = np.random.default_rng(273).normal(size=(80, 90)).astype(np.float32)
-    passed = _high_passed(np.stack([smooth, smooth + fine]), 6.0)
+    passed = high_passed(np.stack([smooth, smooth + fine]), 6.0)
     assert np.abs(passed[0, 10:-10, 10:-10]).max() < 0.1
     np.testing.assert_allclose(passed[1] - passed[0], fine, atol=0.5)
-    np.testing.assert_array_equal(_high_passed(fine[None], 0)[0], fine)
-    assert STAGES[-1].blur == 0 and not STAGES[-1].whiten
+
+
+@pytest.mark.parametrize("half", [12, 13])
+def test_patterns_are_halved_as_frames_are(half):
+    """The middle stays in the middle; two nodes a pixel are, at the pixels, what one is."""
+    rng, m = np.random.default_rng(274), 2 * half + 1
+    fine = np.zeros((1, 2, 2 * m - 1, 2 * m - 1), np.float32)
+    fine[..., 8:-8, 8:-8] = cv2.GaussianBlur(rng.normal(size=(2 * m - 17, 2 * m - 17)), (0, 0), 3)
+    one = np.ascontiguousarray(fine[..., ::2, ::2])
+    small, small_fine = reduced(one, 1), reduced(fine, 2)
+    trim = half % 2
+    expected = cv2.pyrDown(np.ascontiguousarray(one[0, 0, trim : m - trim, trim : m - trim]))
+    np.testing.assert_allclose(small[0, 0, 2:-2, 2:-2], expected[2:-2, 2:-2], atol=1e-5)
+    middle = small.shape[-1] // 2, small_fine.shape[-1] // 2
+    assert small_fine[0, 0, middle[1], middle[1]] == pytest.approx(small[0, 0, middle[0], middle[0]], abs=1e-5)
+
+
+# -------------------- any amplitude, any unit, any pixel
+
+
+@pytest.fixture(scope="module")
+def tenfold(microscope):
+    """Sixty particles whose amplitudes differ tenfold, and their frame."""
+    rng = np.random.default_rng(301)
+    true = anywhere(rng, 60).assign(brightness=np.exp(0.6 * rng.standard_normal(60)))
+    return true, microscope.render(true, rng=rng)
+
+
+def test_amplitudes_that_differ_tenfold(calibration, tenfold):
+    true, frame = tenfold
+    measured = joint(frame, calibration)
+    found, pairs = scores(measured, true), match(measured, true)
+    assert found["recall"] >= 0.96 and found["precision"] >= 0.96 and found["sigma_z_um"] < SIGMA_Z_UM
+    ratio = measured["amplitude"].to_numpy()[pairs["measured"]] / true["brightness"].to_numpy()[pairs["true"]]
+    assert np.median(np.abs(ratio - 1)) < 0.03
+    assert (measured["chi2_without"] > measured["chi2"]).all()
+
+
+@pytest.mark.parametrize("unit", [1 / 20, 1e-3, 1e4])
+def test_the_unit_of_counts_does_not_matter(calibration, tenfold, unit):
+    _, frame = tenfold
+    plain, scaled = (
+        joint(frame.astype(np.float32), calibration),
+        joint(frame.astype(np.float32) * np.float32(unit), calibration),
+    )
+    assert len(plain) == len(scaled)
+    np.testing.assert_allclose(scaled[["x_px", "y_px", "z_um"]], plain[["x_px", "y_px", "z_um"]], atol=2e-3)
+    np.testing.assert_allclose(scaled["amplitude"], unit * plain["amplitude"], rtol=1e-3)
+
+
+def test_threads_do_not_matter(calibration, tenfold):
+    frame = tenfold[1].astype(np.float32)
+    tables = []
+    for threads in (1, 2):
+        plan = Joint(calibration.model, frame.shape, threads)
+        tables.append(plan.table(plan.first(frame)))
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
+def test_hot_and_saturated_pixels_are_left_out_and_counted(calibration, tenfold):
+    true, frame = tenfold
+    spoilt = np.minimum(frame, 3000)
+    spoilt.flat[np.random.default_rng(302).choice(spoilt.size, 200, replace=False)] = 65_535
+    measured = joint(spoilt, calibration)
+    found = scores(measured, true)
+    assert found["recall"] >= 0.95 and found["precision"] >= 0.95 and found["sigma_z_um"] < 1.5 * SIGMA_Z_UM
+    assert measured.attrs["saturated_px"] > 50 and measured.attrs["defective_px"] >= 190
+
+
+@pytest.mark.parametrize("counts", [400, 2000])
+def test_a_background_that_changes_over_two_templates(microscope, calibration, counts):
+    rng, (y, x) = np.random.default_rng(303), np.indices((512, 512))
+    true = anywhere(rng, 50)
+    wave = counts * (1 + np.sin(2 * np.pi * x / 128) * np.sin(2 * np.pi * y / 128 + 1))
+    measured = joint(microscope.render(true, rng=rng) + wave, calibration)
+    found = scores(measured, true)
+    assert found["recall"] >= 0.88 and found["precision"] >= 0.93 and found["sigma_z_um"] < SIGMA_Z_UM
+
+
+def test_debris_is_listed_on_request(microscope, calibration):
+    """A bright bar among particles: not in the table, unless asked for, and counted."""
+    rng, frame_shape = np.random.default_rng(304), (300, 400)
+    true = on_grid(rng, frame_shape)
+    true = true[(true["x_px"] - 200).abs() > 70].reset_index(drop=True)
+    frame = microscope.render(true, frame_shape, rng=rng).astype(np.float32)
+    frame[140:150, 170:230] += 2500
+    plan = Joint(calibration.model, frame_shape)
+    explained = plan.first(frame)
+    default, all_rows = plan.table(explained), plan.table(explained, foreign=True)
+    assert len(match(default, true)) == len(true) == len(default)
+    assert len(all_rows) > len(default) and default.attrs["foreign"] >= len(all_rows) - len(default)
+
+
+def test_both_sides_of_focus(microscope):
+    """Without astigmatism wide images have a twin beyond focus; the likelihood decides, and says how surely."""
+    plain = Microscope(cylinder_um=None)
+    made = Calibration.from_stack(plain.stack(Z_UM, SIZE_PX, rng=305), Z_UM)
+    true = anywhere(np.random.default_rng(306), 40)
+    measured = joint(plain.render(true, rng=307), made)
+    found = scores(measured, true)
+    assert found["recall"] >= 0.95 and found["precision"] >= 0.95
+    has = measured["z_other_um"].notna()
+    assert has.any() and ((measured["z_other_um"] - measured["z_um"]).abs()[has] > 4).all()
+    assert (measured["ambiguous"] == (measured["log_ratio"] < 20)).all() and (
+        measured["log_ratio"][~has] == np.inf
+    ).all()
+
+
+def test_a_plane_decides_between_two_depths():
+    """The third particle's other depth lies on the plane of all."""
+    rows = pd.DataFrame(
+        {"z_um": [5.0, 5.2, -8.0, 4.9], "z_other_um": [-5.0, np.nan, 5.1, -4.0], "log_ratio": [9.0, np.inf, 2.0, 30.0]}
+    )
+    decided = decided_by_plane(rows)
+    assert decided["z_um"].tolist() == [5.0, 5.2, 5.1, 4.9]
+    assert decided["z_other_um"].tolist()[2] == -8.0 and decided["log_ratio"].tolist()[2] == -2.0
+    with pytest.raises(ValueError, match="log_ratio"):
+        decided_by_plane(rows.drop(columns="log_ratio"))

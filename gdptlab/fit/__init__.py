@@ -2,5 +2,6 @@
 
 from gdptlab.fit.joint import Explained, Joint
 from gdptlab.fit.model import PatternModel
+from gdptlab.fit.plane import decided_by_plane
 
-__all__ = ["Explained", "Joint", "PatternModel"]
+__all__ = ["Explained", "Joint", "PatternModel", "decided_by_plane"]
