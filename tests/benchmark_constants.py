@@ -72,7 +72,7 @@ def main() -> None:
         found = beads.find_beads(scan, z_um)
         for value in (0.03, 0.06, 0.12):
             with changed(pattern, "RIM", value):
-                print(f"bead_images.RIM = {value}: {name}: size {beads._size(scan, found)} px", flush=True)
+                print(f"pattern.RIM = {value}: {name}: size {beads._size(scan, found)} px", flush=True)
         made = Calibration.from_scan(scan, z_um, size=size)
         for value in (0.005, 0.01, 0.02, 0.04, 0.08):
             with changed(quality, "DIP", value):
