@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from gdptlab._files import written_whole
 ROOT = Path(__file__).resolve().parents[1]
 """Folder of the checkout."""
 
-COMMANDS = ("run", "measure", "report", "-h", "--help")
+COMMANDS = ("run", "sweep", "measure", "report", "-h", "--help")
 """First words of a command line that does not just name notebooks."""
 
 BAD = 3
@@ -44,8 +45,8 @@ def select(names: Sequence[str], notebooks: Sequence[Path]) -> list[Path]:
     return list(chosen)
 
 
-def execute(notebook: Path) -> str:
-    """Execute one notebook in its own folder, and write it back if every cell ran.
+def execute(notebook: Path, save: bool = True) -> str:
+    """Execute one notebook in its own folder, and with `save` write it back if every cell ran.
 
     Returns
     -------
@@ -71,21 +72,22 @@ def execute(notebook: Path) -> str:
             record_timing=False,
             store_widget_state=False,
             coalesce_streams=True,
-        ).execute(cwd=str(notebook.parent))
+        ).execute(cwd=str(notebook.parent), env=os.environ | {"GDPTLAB_SAVE": str(int(save))})
         document.metadata = metadata
         for part in document.cells:  # a progress bar is no result, and comes back from the file at 0 %
             if part.cell_type == "code":
                 part.outputs = [o for o in part.outputs if WIDGET not in o.get("data", {})]
-        with written_whole(notebook) as temporary:
-            nbformat.write(document, temporary)
+        if save:
+            with written_whole(notebook) as temporary:
+                nbformat.write(document, temporary)
     except Exception as error:  # whatever it is, the other notebooks still get their turn
         kind, text = getattr(error, "ename", type(error).__name__), getattr(error, "evalue", error)
         return f"cell {cell}: {kind}: {text}"
     return ""
 
 
-def run(notebooks: Sequence[Path], figures: Path) -> pd.DataFrame:
-    """Execute notebooks in place, one after the other, and watch the folder `figures`.
+def run(notebooks: Sequence[Path], figures: Path, save: bool = True) -> pd.DataFrame:
+    """Execute notebooks, one after the other, and watch the folder `figures`; with `save`, write them back.
 
     Returns
     -------
@@ -96,13 +98,13 @@ def run(notebooks: Sequence[Path], figures: Path) -> pd.DataFrame:
 
     def files() -> set[tuple[str, int]]:
         """Names of the figures, and when they were written (ns)."""
-        return {(file.name, file.stat().st_mtime_ns) for file in figures.glob("[!.]*")}
+        return {(file.name, file.stat().st_mtime_ns) for file in figures.rglob("[!.]*.*")}
 
     rows = []
     for notebook in (bar := tqdm(notebooks, unit="notebook")):
         bar.set_description(notebook.stem)
         before, start = files(), perf_counter()
-        error, seconds = execute(notebook), round(perf_counter() - start, 1)
+        error, seconds = execute(notebook, save), round(perf_counter() - start, 1)
         rows.append((notebook.stem, seconds, ", ".join(sorted(name for name, _ in files() - before)), error))
     return pd.DataFrame(rows, columns=["notebook", "seconds", "figures", "error"])
 
@@ -116,7 +118,7 @@ def run_notebooks(options: argparse.Namespace, root: Path) -> int:
     if options.list:
         print("\n".join(path.stem for path in chosen))
         return 0
-    table = run(chosen, root / "figures")
+    table = run(chosen, root / "figures", options.save)
     failed = table["error"] != ""
     table["seconds"] = table["seconds"].astype(str).mask(failed, "FAILED")
     print(table.drop(columns="error").to_string(index=False))
@@ -171,9 +173,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     add = commands.add_parser
-    runs = add("run", help="execute notebooks in place", description="Execute the notebooks in place.")
+    runs = add(
+        "run", help="execute notebooks", description="Execute the notebooks; what they show is kept with --save."
+    )
     runs.add_argument("notebook", nargs="*", help="stem, file name or leading number; all if none is named")
     runs.add_argument("--list", action="store_true", help="list the notebooks and leave")
+    runs.add_argument(
+        "--save",
+        action="store_true",
+        help="write outputs into the notebooks, and figures into figures/ (not figures/mine)",
+    )
+    add("sweep", help="compute the tables of Figure 5 anew", add_help=False)
     measures = add(
         "measure",
         help="measure your own images",
@@ -219,6 +229,10 @@ def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] not in COMMANDS:
         arguments.insert(0, "run")  # `python -m gdptlab 02 03` runs notebooks
+    if arguments[0] == "sweep":
+        from gdptlab.experiment import figure5
+
+        return figure5.main(arguments[1:])
     parser = _parser()
     options = parser.parse_args(arguments)
     try:

@@ -39,7 +39,7 @@ def test_runs_all_in_order_and_reports(root: Path, capsys: pytest.CaptureFixture
     first, broken, last = sorted((root / "notebooks").iterdir())
     untouched = broken.read_bytes()
 
-    assert main([], root=root) == 1
+    assert main(["--save"], root=root) == 1
 
     assert outputs(first)[0][0].text == "a\nb\n"
     assert outputs(first)[2][0].data["text/plain"] == "2"
@@ -54,6 +54,15 @@ def test_runs_all_in_order_and_reports(root: Path, capsys: pytest.CaptureFixture
     assert words[2][1:] == ["FAILED"]
     assert words[3][2:] == ["fig2.png"]
     assert "02_broken, cell 3: ZeroDivisionError: division by zero" in err
+
+
+def test_nothing_is_written_unless_asked(root: Path) -> None:
+    """Figures go where the environment of the kernel says; the notebooks stay as they are."""
+    notebook = write(root / "notebooks" / "03_env.ipynb", "import os; open(os.environ['GDPTLAB_SAVE'], 'w').close()")
+    before = notebook.read_bytes()
+    assert main(["03"], root=root) == 0
+    assert notebook.read_bytes() == before
+    assert (root / "notebooks" / "0").exists() and not (root / "notebooks" / "1").exists()
 
 
 def test_running_again_changes_no_byte(root: Path) -> None:
