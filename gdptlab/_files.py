@@ -7,8 +7,8 @@ import os
 import shutil
 import time
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from uuid import uuid4
@@ -114,10 +114,11 @@ def sources_folder(name: str) -> Path | None:
     folder = cache_folder(f"{name}-{sources_digest()}")
     if folder is None:
         return None
-    os.utime(folder)  # its time tells when it was last used
-    for other in folder.parent.glob(f"{name}-*"):
-        if other != folder and time.time() - other.stat().st_mtime > UNUSED_DAYS * 86400:
-            shutil.rmtree(other, ignore_errors=True)
+    with suppress(OSError):  # another process may remove the same folders
+        os.utime(folder)  # its time tells when it was last used
+        for other in folder.parent.glob(f"{name}-*"):
+            if other != folder and time.time() - other.stat().st_mtime > UNUSED_DAYS * 86400:
+                shutil.rmtree(other, ignore_errors=True)
     return folder
 
 
@@ -128,3 +129,9 @@ def kept_arrays(path: Path) -> dict[str, NDArray] | None:
             return {name: file[name] for name in file.files}
     except (OSError, ValueError, EOFError, BadZipFile, zlib.error):
         return None
+
+
+def keep_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write arrays to an .npz file of the cache; if that fails, as on a full disk, they are computed again later."""
+    with suppress(OSError), written_whole(path) as temporary:
+        np.savez_compressed(temporary, **arrays)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gdptlab._checks import choice
 
 DATA = Path(__file__).parents[1] / "data"
-"""The samples' folder."""
+"""Folder of the samples."""
 
 SAMPLES = ("fluorescent", "brightfield", "disturbed")
 """Image types of which there is a sample (the paper, Figure 3)."""
@@ -97,10 +97,10 @@ def planar_beads() -> PlanarBeads:
     Raises
     ------
     FileNotFoundError
-        If they are in neither place; the message says how to get them.
+        If they are in neither folder; the message says how to get them.
     """
-    places = [Path(p) for p in (os.environ.get("GDPTLAB_DATA"), DATA / "external") if p]
-    folder = next((p / "planar_beads" for p in places if (p / "planar_beads").is_dir()), None)
+    folders = [Path(p) for p in (os.environ.get("GDPTLAB_DATA"), DATA / "external") if p]
+    folder = next((p / "planar_beads" for p in folders if (p / "planar_beads").is_dir()), None)
     if folder is None:
         raise FileNotFoundError(
             "The planar-bead images are not on this machine. Their authors publish them on GitHub in the repository "

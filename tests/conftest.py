@@ -1,13 +1,14 @@
 """Microscope, calibrations and frames that many tests fraction; each is made once."""
 
 import os
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from gdptlab import Calibration
-from gdptlab.experiment import Microscope
+from gdptlab.experiment import Microscope, disturbed
 
 THOROUGH = bool(os.environ.get("GDPTLAB_THOROUGH"))
 """Whether tests that can be made longer are: `GDPTLAB_THOROUGH=1 pytest tests/test_stream.py`, some minutes each."""
@@ -15,6 +16,16 @@ THOROUGH = bool(os.environ.get("GDPTLAB_THOROUGH"))
 Z_UM = np.linspace(-50, 50, 51)
 SIZE_PX = 61
 IMAGE_TYPES = ("fluorescent", "brightfield", "disturbed")
+MILD = 80.0
+"""Amplitude (counts) of the disturbance in the tests of accuracy: a fifth of the dimmest peak, which moves no particle.
+`test_locate.py` says what the default amplitude, five times as large, does."""
+
+
+def as_tested(image_type: str):
+    """What `Microscope.render` takes for an image type, with the disturbance `MILD`."""
+    return partial(disturbed, amplitude=MILD) if image_type == "disturbed" else image_type
+
+
 CALIBRATION_SEED, FRAME_SEED = 61, 62
 
 
@@ -50,7 +61,7 @@ def clean_stack(microscope):
 def stacks(microscope):
     """Noisy stack of each image type."""
     return {
-        kind: microscope.stack(Z_UM, SIZE_PX, image_type=kind, rng=CALIBRATION_SEED + i)
+        kind: microscope.stack(Z_UM, SIZE_PX, image_type=as_tested(kind), rng=CALIBRATION_SEED + i)
         for i, kind in enumerate(IMAGE_TYPES)
     }
 
@@ -81,6 +92,6 @@ def isolated(microscope):
     for i, kind in enumerate(IMAGE_TYPES):
         rng = np.random.default_rng(FRAME_SEED + 10 * i)
         tables = [on_grid(rng).assign(frame=frame) for frame in range(10)]
-        frames = [microscope.render(t, (512, 700), image_type=kind, rng=rng) for t in tables]
+        frames = [microscope.render(t, (512, 700), image_type=as_tested(kind), rng=rng) for t in tables]
         films[kind] = frames, pd.concat(tables, ignore_index=True)
     return films

@@ -136,7 +136,7 @@ def test_sound_may_be_weak_but_not_absent(seed):
         for axis, std in (("y", 0.01), ("z", 0.12)):
             table[f"{axis}_um"] += rng.normal(0, std, len(table))
     assert fit_energy(weak, sound(), FPS).loc["E_J_m3", "value"] == pytest.approx(0.01, rel=0.01)
-    with pytest.raises(ValueError, match=r"along . fits no rate|hardly move along"):
+    with pytest.raises(ValueError, match=r"^tracks: "):
         fit_energy(none, sound(), FPS)
 
 
@@ -146,11 +146,11 @@ def test_sound_may_be_weak_but_not_absent(seed):
         ({"focusing": None}, TypeError, "focusing"),
         ({"frame_rate_hz": -1.0}, ValueError, "frame_rate_hz"),
         ({"confidence": 1.0}, ValueError, "confidence"),
-        ({"tracks": paths(1).drop(columns="z_std_um")}, ValueError, "z_std_um"),
-        ({"tracks": paths(1).assign(y_std_um=0.0)}, ValueError, "above 0"),
-        ({"tracks": paths(1).assign(z_um=np.nan)}, ValueError, "finite"),
-        ({"tracks": paths(1).query("particle == particle.min()")}, ValueError, "3 or more"),
-        ({"tracks": paths(1).groupby("particle").head(1)}, ValueError, "3 or more"),
+        ({"tracks": paths(1).drop(columns="z_std_um")}, ValueError, "^tracks: .*z_std_um"),
+        ({"tracks": paths(1).assign(y_std_um=0.0)}, ValueError, "^tracks: "),
+        ({"tracks": paths(1).assign(z_um=np.nan)}, ValueError, "^tracks: "),
+        ({"tracks": paths(1).query("particle == particle.min()")}, ValueError, "^tracks: "),
+        ({"tracks": paths(1).groupby("particle").head(1)}, ValueError, "^tracks: "),
     ],
 )
 def test_bad_arguments_of_fit_energy(change, error, match):

@@ -150,14 +150,14 @@ def test_empty_bins_are_nan():
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"measured": ONE.drop(columns="z_um")}, ValueError, r"^measured: got no column \['z_um'\], needed are x_px"),
-        ({"true": ONE.drop(columns="x_px")}, ValueError, r"^true: got no column \['x_px'\]"),
-        ({"measured": pd.concat([ONE, ONE])}, ValueError, "^measured: got row labels that repeat, allowed are unique"),
-        ({"true": pd.concat([ONE, ONE])}, ValueError, "^true: got row labels that repeat"),
-        ({"true": ONE.assign(frame=0)}, ValueError, "^measured, true: got a column frame in only one of them"),
-        ({"within_px": 0}, ValueError, "^within_px: got 0, allowed is a finite number above 0"),
-        ({"within_um": -1}, ValueError, "^within_um: got -1"),
-        ({"within_um": "1"}, TypeError, "^within_um: got '1'"),
+        ({"measured": ONE.drop(columns="z_um")}, ValueError, r"^measured: "),
+        ({"true": ONE.drop(columns="x_px")}, ValueError, r"^true: "),
+        ({"measured": pd.concat([ONE, ONE])}, ValueError, "^measured: "),
+        ({"true": pd.concat([ONE, ONE])}, ValueError, "^true: "),
+        ({"true": ONE.assign(frame=0)}, ValueError, "^measured, true: "),
+        ({"within_px": 0}, ValueError, "^within_px: "),
+        ({"within_um": -1}, ValueError, "^within_um: "),
+        ({"within_um": "1"}, TypeError, "^within_um: "),
         ({"within": 1}, TypeError, "within"),
     ],
 )
@@ -169,7 +169,7 @@ def test_refuses(changes, error, message):
 
 @pytest.mark.parametrize("edges", [[1], [1, 1], [2, 1], [0, np.nan], [[0, 1]]])
 def test_refuses_edges(edges):
-    with pytest.raises(ValueError, match=r"^edges_um: got "):
+    with pytest.raises(ValueError, match=r"^edges_um: "):
         scores_by_z(ONE, ONE, edges)
 
 
@@ -241,12 +241,12 @@ def test_assessment_is_the_same_with_the_same_seed():
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"locator": 3}, TypeError, r"^locator: got 3, allowed is a function"),
-        ({"frames": [0]}, ValueError, r"^frames: got 1, allowed are two or more"),
-        ({"true": pd.DataFrame({"x_px": [1.0], "y_px": [1.0], "z_um": [1.0]})}, ValueError, "^true: got columns"),
-        ({"confidence": 1}, ValueError, r"^confidence: got 1, allowed is above 0 and below 1"),
-        ({"edges_um": [3, 2]}, ValueError, "^edges_um: got"),
-        ({"within_px": 0}, ValueError, "^within_px: got 0"),
+        ({"locator": 3}, TypeError, r"^locator: "),
+        ({"frames": [0]}, ValueError, r"^frames: "),
+        ({"true": pd.DataFrame({"x_px": [1.0], "y_px": [1.0], "z_um": [1.0]})}, ValueError, "^true: "),
+        ({"confidence": 1}, ValueError, r"^confidence: "),
+        ({"edges_um": [3, 2]}, ValueError, "^edges_um: "),
+        ({"within_px": 0}, ValueError, "^within_px: "),
     ],
 )
 def test_assessment_refuses(changes, error, message):

@@ -40,9 +40,7 @@ def test_samples_fit_their_truth(image_type):
 
 
 def test_unknown_sample():
-    with pytest.raises(
-        ValueError, match=r"^image_type: got 'dark', allowed are 'fluorescent', 'brightfield', 'disturb"
-    ):
+    with pytest.raises(ValueError, match=r"^image_type: .*'dark'"):
         datasets.sample("dark")
 
 
@@ -50,7 +48,8 @@ def test_samples_can_be_made_again(microscope, tmp_path):
     """To a count here and there, since tracing may round differently on another machine."""
     make_samples(tmp_path)
     names = sorted(p.name for p in tmp_path.iterdir())
-    assert names == sorted(p.name for p in datasets.DATA.iterdir() if p.suffix in (".tif", ".csv"))
+    here = [p.name for p in datasets.DATA.iterdir() if p.suffix in (".tif", ".csv")]
+    assert names == sorted(name for name in here if not name.startswith("figure5"))  # those are no samples
     for name in names:
         if name.endswith(".csv"):
             pd.testing.assert_frame_equal(pd.read_csv(tmp_path / name), pd.read_csv(datasets.DATA / name))

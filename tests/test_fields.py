@@ -1,6 +1,8 @@
 """Mean fields counted by hand, mean squared displacements of a known walk, files that VTK itself reads."""
 
 import warnings
+from base64 import b64decode
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -147,6 +149,30 @@ def test_vtk_reads_tracks(tmp_path, vtk_reader):
     np.testing.assert_allclose(values["particle"], part["particle"])
     np.testing.assert_allclose(values["velocity"], part[["vx_um_s", "vy_um_s", "vz_um_s"]])
     assert "word" not in values
+
+
+def decoded(path):
+    """Arrays of a file of VTK's, by their names, as its documentation says to read them."""
+    arrays = {}
+    for array in ElementTree.parse(path).iter("DataArray"):
+        data = b64decode(array.text)
+        assert int.from_bytes(data[:8], "little") == len(data) - 8
+        values = np.frombuffer(data[8:], {"Float64": "<f8", "Int64": "<i8", "UInt8": "u1"}[array.get("type")])
+        arrays[array.get("Name")] = values.reshape(-1, int(array.get("NumberOfComponents", 1))).squeeze()
+    return arrays
+
+
+def test_files_hold_what_was_written(tmp_path):
+    save_paraview_tracks(TABLE, tmp_path / "tracks.pvd")
+    part, arrays = TABLE[TABLE["frame"] == 0], decoded(tmp_path / "tracks" / "000000.vtu")
+    np.testing.assert_array_equal(arrays["Points"], part[["x_um", "y_um", "z_um"]])
+    np.testing.assert_array_equal(arrays["velocity"][:, :2], part[["vx_um_s", "vy_um_s"]])
+    assert arrays["types"].tolist() == [1] * 5 and arrays["offsets"].tolist() == [1, 2, 3, 4, 5]
+    field = mean_field(TABLE, {"x_um": [0, 5, 10], "y_um": [-3, 3, 9]})
+    save_paraview_field(field, tmp_path / "field.vtr")
+    arrays = decoded(tmp_path / "field.vtr")
+    assert arrays["x_um"].tolist() == [2.5, 7.5] and arrays["y_um"].tolist() == [0, 6]
+    assert arrays["n"].tolist() == [4, 1, 0, 0]  # x is the fastest
 
 
 def test_series_names_its_files_and_times(tmp_path):

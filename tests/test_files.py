@@ -7,11 +7,20 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import gdptlab
 from gdptlab import _files
-from gdptlab._files import UNUSED_DAYS, cache_folder, sources_digest, sources_folder, written_whole
+from gdptlab._files import (
+    UNUSED_DAYS,
+    cache_folder,
+    keep_arrays,
+    kept_arrays,
+    sources_digest,
+    sources_folder,
+    written_whole,
+)
 
 
 def test_content_arrives_under_the_name_asked_for(tmp_path: Path) -> None:
@@ -180,3 +189,33 @@ def test_the_digest_changes_with_any_source(tmp_path, monkeypatch):
         (tmp_path / "room" / "module.py").write_text(text)
         digests.append(sources_digest.__wrapped__())
     assert digests[0] != digests[1] and digests[1] == sources_digest.__wrapped__()
+
+
+# -------------------- arrays in the cache
+
+
+@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:-40], lambda data: b"\0" * len(data)])
+def test_damaged_arrays_are_as_good_as_none(tmp_path, damage):
+    path = tmp_path / "a.npz"
+    assert kept_arrays(path) is None
+    keep_arrays(path, {"a": np.arange(3)})
+    assert kept_arrays(path)["a"].tolist() == [0, 1, 2]
+    path.write_bytes(damage(path.read_bytes()))
+    assert kept_arrays(path) is None
+
+
+def test_arrays_that_cannot_be_kept_stop_nothing(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    keep_arrays(tmp_path / "a.npz", {"a": np.arange(3)})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_package_can_be_imported_where_nothing_can_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    for name in ("GDPTLAB_CACHE", "HOME", "USERPROFILE", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / "file" / "none"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(gdptlab.__file__).parents[1]))
+    subprocess.run([sys.executable, "-c", "import gdptlab.fit.joint, gdptlab.correlation"], check=True)

@@ -23,6 +23,15 @@ from gdptlab.pipeline.quality import report
 from gdptlab.pipeline.settings import choose_settings
 from gdptlab.pipeline.stream import batch_to_parquet
 from gdptlab.pipeline.tables import in_um, save_points, save_table
+from gdptlab.tracking import (
+    link,
+    mean_field,
+    mean_squared_displacement,
+    napari_tracks,
+    save_paraview_field,
+    save_paraview_tracks,
+    velocities,
+)
 
 tried = settings(
     max_examples=2000 if THOROUGH else 60,
@@ -245,7 +254,7 @@ def test_choose_settings(frames, given):
     names = ("frames", "image", "threshold", "method", "refine", "min_distance_px")
     chosen = fails_by_name(lambda: choose_settings(frames, CALIBRATION, **given), *names)
     if chosen is not None:
-        assert 0 < chosen.threshold <= 1 and np.isfinite(chosen.ghosts.astype(float)).all(axis=None)
+        assert 0 < chosen.threshold <= 1 and np.isfinite(chosen.side_lobes.astype(float)).all(axis=None)
 
 
 # -------------------- tables
@@ -306,6 +315,37 @@ def test_tables_out(table, um_per_px, program, given):
             lambda: save_table(table, path.with_suffix(".parquet"), CALIBRATION, **given), "table", "settings"
         )
         assert {p.name for p in Path(folder).iterdir()} <= {"a.csv", "a.csv.json", "a.parquet", "a.parquet.json"}
+
+
+LINK = ("search_range", "predictor", "frame_rate_hz", "memory", "min_rows")
+
+
+@tried
+@given(table=tables(), given=some(*LINK), rate=odd, window=odd)
+def test_tracks(table, given, rate, window):
+    """Linked, with velocities, and on a grid."""
+    fails_by_name(lambda: link(table, **given), "table", *LINK)
+    numbered = table.assign(particle=np.arange(len(table)) // 3) if isinstance(table, pd.DataFrame) else table
+    names = ("tracks", "frame_rate_hz", "window", "longest")
+    fails_by_name(lambda: velocities(numbered, rate, window=window), *names)
+    fails_by_name(lambda: mean_squared_displacement(numbered, rate, longest=window), *names)
+    with tempfile.TemporaryDirectory() as folder:
+        fails_by_name(lambda: save_paraview_tracks(numbered, Path(folder) / "a.pvd", rate), "tracks", "frame_rate_hz")
+        fails_by_name(lambda: save_paraview_field(table, Path(folder) / "a.vtr"), "field")
+        fails_by_name(lambda: napari_tracks(numbered), "tracks")
+
+
+@tried
+@given(
+    table=tables(),
+    cells=st.dictionaries(st.sampled_from(["x_px", "y_px", "z_um", "w"]), odd | st.integers(1, 4), max_size=4) | odd,
+    values=st.sampled_from([None, ["x_px"], ["z_um", "frame"], [], ["w"], "x_px", 3]),
+)
+def test_fields(table, cells, values):
+    field = fails_by_name(lambda: mean_field(table, cells, values), "table", "cells", "values")
+    if field is not None:
+        named = values or []
+        assert field["n"].sum() <= len(table) and field[named][field["n"] > 0].notna().all(axis=None)
 
 
 @tried

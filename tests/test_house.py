@@ -26,8 +26,14 @@ ALLOWED = {
 }
 """What each room may import, besides itself."""
 
-DOORS = {("locate", "fit"), ("calibration", "fit"), ("calibration", "pipeline")}
-"""Modules of the core that may open a room, inside a function: for the joint fit, for calibrations from scans."""
+DOORS = {
+    ("locate", "fit"),
+    ("calibration", "fit"),
+    ("calibration", "pipeline"),
+    ("pipeline/measuring", "tracking"),
+    ("pipeline/measuring", "plots"),
+}
+"""Modules that may open a room above, in a function: for the joint fit, calibrations from scans, tracks and pages."""
 
 ONE_MODULE = {("tracking/acoustic_energy", "experiment")}
 """Modules that may import a room that the rest of their own may not."""

@@ -1,19 +1,18 @@
 """Pictures of the experiment show the data they are given."""
 
-import sys
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image
 
 from gdptlab import plots
 from gdptlab.experiment import replay
 from gdptlab.experiment.channel import Focusing, Trajectories
 from gdptlab.experiment.film import Film
-
-LABELS = pd.DataFrame({"n": [51, 6, 6], "n_sub": [9, 6, 4], "refine": [True, False, True]})
 
 
 @pytest.fixture(autouse=True)
@@ -34,16 +33,15 @@ def monitor() -> pd.DataFrame:
 
 @pytest.fixture
 def points() -> pd.DataFrame:
-    """Summary of three settings for both triggers; the last never fired."""
-    rows = pd.concat([LABELS.assign(trigger=a, tau_s=[0.012, 0.01, 0.009]) for a in "hw"])
-    rows = rows.assign(films=10, replays=80, failed=[0, 16, 80] * 2)
-    return rows.assign(
-        **{
-            f"{kind}_{k}": [0.1, 0.3, np.nan] * 2
-            for kind in ("error_s", "own_error_s")
-            for k in ("median", "q25", "q75")
-        }
+    """Verdicts on three settings of two evaluators, for both triggers; all films of the last failed."""
+    rows = pd.DataFrame(
+        {"evaluator": ["gdptlab", "OpenCV", "OpenCV"], "n_sub": [9, 9, 4], "refine": [True, False, True]}
     )
+    rows = rows.assign(
+        tau_s=[0.01, 0.1, 0.2], median=[0.1, 0.3, np.nan], q25=[0.0, 0.2, np.nan], q75=[0.2, 0.5, np.nan]
+    )
+    rows = rows.assign(failed=[0.0, 0.2, 1.0], failed_low=[0, 0.1, 0.7], failed_high=[0.2, 0.4, 1.0], films=10)
+    return pd.concat([rows.assign(trigger=a) for a in "hw"], ignore_index=True)
 
 
 @pytest.fixture(scope="module")
@@ -57,51 +55,55 @@ def texts(figure: Figure) -> str:
 
 def test_figure_4_draws_every_particle_of_the_view_at_each_instant() -> None:
     trajectories = Trajectories.seeded(Focusing(), 1, mean_in_view=20, duration_s=5)
-    figure = plots.fig4_acoustophoresis(trajectories, (0, 2.5))
+    figure = plots.fig4_acoustophoresis(trajectories, trajectories, {"start": 0, "later": 2.5})
     for panel, t in zip(figure.subfigs[1].get_axes(), (0, 2.5), strict=True):
         here = trajectories.positions(t)
         np.testing.assert_array_equal(panel.get_lines()[0].get_xydata(), here[["y_um", "z_um"]])
-    assert all(word in texts(figure) for word in ("w = 200 µm", "h = 100 µm", "t = 2.5 s", "x (µm), downstream"))
-
-
-def test_forces_and_flow_have_units() -> None:
-    shown = texts(plots.forces_and_flow(Focusing()))
-    assert all(word in shown for word in ("y (µm)", "z (µm)", "$u_y$ (µm/s)", "$u_z$ (µm/s)", "u (µm/s)"))
-
-
-def test_focusing_in_time(monitor: pd.DataFrame) -> None:
-    fraction = {a: monitor["true_fraction_h"] for a in "hw"}
-    figure = plots.focusing_in_time(monitor["t_s"], fraction, monitor, {"h": 2.0, "w": 2.0}, 0.9)
-    assert "= 2.00 s" in texts(figure)
+    shown = texts(figure)
+    assert all(word in shown for word in ("w = 200 µm", "h = 100 µm", "later: 2.5 s", "x (µm), downstream"))
+    assert f"{len(trajectories.start)} paths" in shown
 
 
 def test_monitor_marks_when_each_measured_fraction_first_reaches_the_level(monitor: pd.DataFrame) -> None:
-    figure = plots.monitor_in_time(monitor)
-    marked = [line.get_xdata()[0] for line in figure.axes[0].get_lines() if line.get_marker() == "v"]
+    figure, axes = plt.subplots()
+    plots.draw_monitor(axes, monitor)
+    marked = [line.get_xdata()[0] for line in axes.get_lines() if line.get_marker() == "v"]
     assert marked == pytest.approx([2.4, 2.4])
+    plt.close(figure)
 
 
-def test_figure_5_shows_failures_as_crosses_that_count_films(points: pd.DataFrame) -> None:
-    band = replay.expected_delay([0.005, 0.02], 0.2, 0.04)
-    counts = {name: pd.Series([9, 8], index=[0.0, 1.0]) for name in ("full", "true")}
-    figure = plots.fig5(points, band, counts, colour="n")
+def test_figure_5_counts_films_that_failed_on_top(points: pd.DataFrame) -> None:
+    band = replay.expected_delay([0.005, 0.5], 0.2, 0.04)
+    figure = plots.fig5_times(points, band, colour="n_sub")
     strip = figure.axes[0]
-    crosses = [line.get_xydata()[0].tolist() for line in strip.get_lines() if line.get_marker() == "x"]
-    assert crosses == [pytest.approx([10, 2]), pytest.approx([9, 10])]  # ms, films
-    assert all(word in texts(figure) for word in ("(a)", "(b)", "(c)", "evaluation time τ (ms)", "failed, of 10"))
+    heights = [line.get_ydata()[0] for line in strip.get_lines() if len(line.get_ydata()) == 1]
+    assert heights == pytest.approx([0, 20, 100])  # %
+    assert all(word in texts(figure) for word in ("(a)", "(b)", "measured evaluation time τ (s)", "10 films"))
+
+
+def test_settings_side_by_side_say_how_many_films_failed(points: pd.DataFrame) -> None:
+    both = pd.concat([points.assign(refine=r) for r in (True, False)]).set_index("n_sub")
+    both = both[both["evaluator"] == "OpenCV"]
+    time = pd.DataFrame({"count": [9, 8], "valid": [9, 7]}, index=[0.0, 1.0])
+    figure = plots.fig5_settings(both, {9: "nine", 4: "four"}, {"full": time, "true": time[["count"]]})
+    shown = texts(figure)
+    assert all(word in shown for word in ("20% (10%–40%)", "100% (70%–100%)", "nine", "four"))
+    lines = [line.get_ydata() for line in figure.axes[2].get_lines()]
+    assert [list(y) for y in lines] == [[9, 8], [9, 7], [9, 8]]
 
 
 def test_error_against_tau(points: pd.DataFrame) -> None:
     band = replay.expected_delay([0.04, 1, 5])
-    figure = plots.error_against_tau(points, band, by="n", tau_here_s=0.011)
-    assert "here: 11 ms" in texts(figure)
+    figure = plots.error_against_tau(points, band, by="evaluator")
+    assert {"gdptlab", "OpenCV"} <= {t.get_text() for t in figure.axes[2].get_legend().get_texts()}
 
 
-def test_templates_and_densities_say_how_many_failed(points: pd.DataFrame) -> None:
-    points = points.assign(density=[25.0, 25.0, 50.0] * 2, size=[31, 61, 31] * 2)
-    found = pd.DataFrame({"density": [25.0, 50.0], "size": 31, "t_s": 0.0, "fraction": 0.9})
-    shown = texts(plots.templates_and_densities(points, found))
-    assert all(word in shown for word in ("0/10", "× 2/10", "× 10/10", "50 particles in view"))
+def test_an_animation_shows_each_moment(film: Film, monitor: pd.DataFrame, tmp_path: Path) -> None:
+    animation = plots.replay_animation(film, film.truth(), monitor, [0, 50])
+    plots.save_animation(animation, tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as picture:
+        assert picture.n_frames == 2
+    assert "<script" in plots.player(animation)
 
 
 def test_one_moment_of_the_replay(film: Film, monitor: pd.DataFrame) -> None:
@@ -109,25 +111,5 @@ def test_one_moment_of_the_replay(film: Film, monitor: pd.DataFrame) -> None:
     figure = plots.replay_view(film, measured, monitor, 50)
     here = int((measured["frame"] == 50).sum())
     assert f"{here} measured (dots) of {here} (crosses)" in texts(figure)
-    shared = [a for a in figure.axes if a.get_ylabel() == "fraction of particles"]
-    assert max(line.get_xdata()[-1] for line in shared[0].get_lines()[1:]) == pytest.approx(2.0)
-
-
-def test_instants() -> None:
-    images = {name: np.random.default_rng(1).normal(500, 40, (60, 90)) for name in ("t = 0 s", "t = 1 s")}
-    assert "t = 1 s" in texts(plots.instants(images, 0.65))
-
-
-def test_slider(film: Film, monitor: pd.DataFrame) -> None:
-    ipywidgets = pytest.importorskip("ipywidgets")
-    view = plots.scrub(film, film.truth(), monitor)
-    assert isinstance(view, ipywidgets.VBox)
-    assert len(view.children[0].options) == len(monitor)
-
-
-def test_slider_without_ipywidgets_says_what_to_install(
-    film: Film, monitor: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "ipywidgets", None)
-    with pytest.raises(ImportError, match=r"pip install 'gdptlab\[widgets\]'"):
-        plots.scrub(film, film.truth(), monitor)
+    curves = next(a for a in figure.axes if a.get_ylabel() == "fraction of particles")
+    assert max(line.get_xdata()[-1] for line in curves.get_lines()[1:]) == pytest.approx(2.0)

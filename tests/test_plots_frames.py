@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from gdptlab import Calibration, plots
 from gdptlab.denoising import signal_to_noise
+from gdptlab.plots.style import FIGURES, stretched
 
 
 @pytest.fixture(autouse=True)
@@ -84,34 +85,19 @@ def test_contact_sheet_has_a_row_for_each_stack(calibration: Calibration) -> Non
 
 
 def test_scale_bar_is_as_long_as_it_says(frame: np.ndarray) -> None:
-    figure = plots.fig3_image_types({"fluorescent": frame, "brightfield": 1000 - frame}, 2.5)
+    figure = plots.side_by_side({"fluorescent": frame, "brightfield": 1000 - frame}, 2.5)
     x = figure.axes[0].get_lines()[0].get_xdata()
     assert np.ptp(x) * 2.5 == pytest.approx(50)
     assert figure.axes[0].texts[0].get_text() == "50 µm"
-    assert labels(figure)[2::3] == ["(a) fluorescent", "(b) brightfield"]
+    assert labels(figure)[2::3] == ["fluorescent", "brightfield"]
 
 
-def test_width_and_peak() -> None:
-    table = pd.DataFrame(
-        {"z_um": [-1, 0, 1], "width_x_um": [3, 1, 2], "width_y_um": [2, 1, 3], "peak_counts": [4, 9, 5]}
-    )
-    figure = plots.width_and_peak({"astigmatic": table, "plain": table})
-    assert curve(figure.axes[0], 0).tolist() == [3, 1, 2]
-    assert curve(figure.axes[1], 1).tolist() == [2, 1, 3]
-    assert curve(figure.axes[2], 1).tolist() == [4, 9, 5]
-    assert {"RMS width (µm)", "light (counts)", "z (µm)"} <= set(labels(figure))
-
-
-def test_compared_images_show_the_difference_in_per_cent_of_the_peak() -> None:
-    first = np.diag([1.0, 2.0, 4.0])
-    figure = plots.compared_images({"a": first, "b": first + 0.2}, 0.5)
-    np.testing.assert_allclose(figure.axes[2].images[0].get_array(), 100 * 0.2 / 4.2)
-
-
-def test_self_similarity_is_drawn_over_depth(calibration: Calibration) -> None:
-    figure = plots.self_similarity({"this": calibration.self_similarity()}, calibration.z_um)
-    assert figure.axes[0].images[0].get_extent() == [-32.5, 32.5, -32.5, 32.5]
-    assert "z of one image (µm)" in labels(figure)
+def test_stretching_shows_dim_particles_on_dark_and_on_bright() -> None:
+    light = np.zeros((9, 9))
+    light[2, 2], light[6, 6] = 400.0, 4000.0
+    dark, bright = stretched(light), stretched(20_000 - light)
+    assert dark[2, 2] == pytest.approx(np.sqrt(0.1)) and dark[6, 6] == 1
+    np.testing.assert_allclose(bright, 1 - dark)
 
 
 def test_calibration_quality(calibration: Calibration) -> None:
@@ -121,40 +107,47 @@ def test_calibration_quality(calibration: Calibration) -> None:
 
 
 def test_expected_profiles_are_rows_of_the_map(calibration: Calibration) -> None:
-    figure = plots.expected_profiles(calibration, [-31, 9])
-    map_, rows = figure.axes[:2]
+    figure = plt.figure()
+    plots.expected_profiles(figure, calibration)
+    map_, rows = figure.subfigs[1].axes[:2]
     np.testing.assert_array_equal(map_.images[0].get_array(), calibration.expected)
-    np.testing.assert_array_equal(curve(rows, 1), calibration.expected[8])  # 10 µm is nearest
-    assert rows.get_legend().get_texts()[1].get_text() == "z = +10 µm"
+    np.testing.assert_array_equal(curve(rows), calibration.expected[2])  # the second of six depths
     assert map_.get_ylabel() == "z of the particle (µm)"
-
-
-def test_fig2_shows_what_it_is_given(calibration: Calibration, frame: np.ndarray) -> None:
-    maps = np.random.default_rng(2).random((4, 40, 70))
-    profile, likeness = np.array([0.5, 0.7, 0.9, 0.6]), np.linspace(-1, 1, 13)
-    peak = frame[:41, :41], calibration.templates[6], np.eye(21)
-    figure = plots.fig2_calibration_map(calibration, frame, maps, (40, 30), profile, likeness, peak, 0.65)
-    _, b, c, d = figure.subfigs
-    np.testing.assert_array_equal(b.subfigs[1].axes[3].images[0].get_array(), maps[3])
-    np.testing.assert_array_equal(c.axes[0].get_lines()[-1].get_ydata(), profile)
-    assert c.axes[1].texts[0].get_text() == "+30 µm"
-    assert "peak $C_m$ = 1.00" in labels(d)
+    titles = [a.get_title() for a in figure.subfigs[0].axes if a.images]
+    assert len(titles) == 13 + 4  # the stack, and the subset
+    plt.close(figure)
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_correlation_maps_lie_where_their_windows_centre(frame: np.ndarray, half: bool) -> None:
+def test_maps_are_cut_out_around_the_particle(frame: np.ndarray, half: bool) -> None:
     r = np.arange(25) - 12
     width = np.linspace(6, 8, 5) if half else np.linspace(0.7, 0.9, 5)  # px: blurred, or too sharp to be halved
     stack = np.exp(-(r**2 + r[:, None] ** 2) / (2 * width[:, None, None] ** 2))
     calibration = Calibration.from_stack(stack, np.arange(5.0), n_sub=2)
     assert calibration.half_resolution == half
-    searched = frame[::2, ::2] if half else frame
-    maps = calibration.correlator(searched.shape)(searched.astype(np.float32))
-    figure = plots.correlation_maps(frame, maps, calibration)
-    left, right, bottom, top = figure.subfigs[1].axes[0].images[0].get_extent()
-    step = 2 if half else 1
-    assert (left + step / 2, top + step / 2) == (12, 12)
-    assert (right - left, bottom - top) == (step * maps.shape[2], step * maps.shape[1])
+    scale = 2 if half else 1
+    margin = calibration.search_templates.shape[-1] // 2
+    maps = np.zeros((2, *(n // scale - 2 * margin for n in frame.shape)))
+    row, column = 30 // scale - margin, 40 // scale - margin
+    maps[1, row, column] = 0.75
+    figure = plt.figure()
+    plots.maps_around(figure, frame, maps, calibration, pd.Series({"x_px": 40.0, "y_px": 30.0}))
+    panel = next(a for a in figure.subfigs[1].axes[1:] if "0.75" in a.get_title())
+    x, y = panel.get_lines()[0].get_xydata()[0].astype(int)
+    assert panel.images[0].get_array()[y, x] == 0.75
+    plt.close(figure)
+
+
+def test_profile_and_peak_show_what_they_are_given(calibration: Calibration, frame: np.ndarray) -> None:
+    profile, agreement = np.array([0.5, 0.7, 0.9, 0.6]), np.linspace(-1, 1, 13)
+    figure = plt.figure()
+    c, d = figure.subfigures(2, 1)
+    plots.profile_match(c, profile, calibration, agreement)
+    plots.correlation_peak(d, frame[:41, :41], calibration.templates[6], np.eye(21), 0.65)
+    np.testing.assert_array_equal(c.axes[0].get_lines()[-1].get_ydata(), profile)
+    assert c.axes[1].texts[0].get_text() == "+30 µm"
+    assert d.axes[2].get_title() == "peak $C_m$ = 1.00"
+    plt.close(figure)
 
 
 def test_mean_errors_are_those_of_the_bins() -> None:
@@ -173,16 +166,36 @@ def test_score_curves_with_spread_and_a_chosen_setting() -> None:
     assert [t.get_text() for t in figure.axes[0].get_xticklabels()] == ["3", "9"]
 
 
+def test_scores_that_are_not_there_can_be_drawn() -> None:
+    nothing = pd.DataFrame({"sigma_z_um": [np.nan, np.nan]}, index=[1.0, 2.0])
+    figure = plots.score_curves({"a": nothing}, "x", columns=["sigma_z_um"])
+    assert figure.axes[0].get_ylim()[1] > 0
+
+
 def test_saved_figures_are_the_same_each_time(tmp_path: Path, frame: np.ndarray) -> None:
     for name in ("one.png", "two.png"):
-        plots.save(plots.fig3_image_types({"a": frame}, 1.0), name, tmp_path)
+        plots.save(plots.side_by_side({"a": frame}, 1.0), name, tmp_path)
     one, two = (Path(tmp_path, name).read_bytes() for name in ("one.png", "two.png"))
     assert one == two
     assert b"Software" not in one
-    with pytest.raises(ValueError, match=r"name: got 'fig\.pdf'"):
+    with pytest.raises(ValueError, match="name"):
         plots.save(Figure(), "fig.pdf", tmp_path)
+
+
+def test_figures_of_the_repository_are_kept_unless_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gdptlab.plots.style.FIGURES", tmp_path)
+    monkeypatch.delenv("GDPTLAB_SAVE", raising=False)
+    plots.save(Figure(), "a.png")
+    assert [p.name for p in tmp_path.iterdir()] == ["mine"] and (tmp_path / "mine" / "a.png").exists()
+    monkeypatch.setenv("GDPTLAB_SAVE", "1")
+    plots.save(Figure(), "a.png")
+    assert (tmp_path / "a.png").exists()
 
 
 def test_a_figure_that_fails_is_closed() -> None:
     with pytest.raises(KeyError):
         plots.frame_with_particles(np.eye(9), pd.DataFrame({"x": [1]}))
+
+
+def test_figures_lie_in_the_repository() -> None:
+    assert FIGURES == Path(__file__).parents[1] / "figures"

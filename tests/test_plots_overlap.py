@@ -29,8 +29,8 @@ def test_found_missed_and_false_are_told_apart() -> None:
     assert first.get_title(loc="left") == "one: 1 found, 2 missed, 1 false"
     assert second.get_title(loc="left") == "two: 3 found, 0 missed, 0 false"
     np.testing.assert_array_equal(below.images[0].get_array(), left["one"])
-    assert below.images[0].get_clim() == (-plots.REACH, plots.REACH)
-    assert bar.get_ylabel() == "left over (noise of a pixel)"
+    assert below.images[0].get_clim() == (-plots.RESIDUAL_END, plots.RESIDUAL_END)
+    assert bar.get_ylabel() == "residual (noise of a pixel)"
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["found", "missed", "false"]
 
 
@@ -48,7 +48,7 @@ def test_a_particle_laid_bare_has_a_scale_for_each_half_of_its_row() -> None:
 
 def test_error_ratios_keep_what_is_beyond_the_scale() -> None:
     table = pd.DataFrame({"x": [-1.0, 0.0, 1.0, 99.0], "z": [1.0, 1.0, 1.0, 1.0]})
-    figure = plots.error_ratios({"few": table}, reach=6)
+    figure = plots.error_ratios({"few": table}, limit=6)
     left, right = figure.axes
     (stairs,) = left.patches
     density, edges, _ = stairs.get_data()

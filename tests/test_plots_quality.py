@@ -10,7 +10,6 @@ import pytest
 from gdptlab import locate, plots
 from gdptlab.pipeline import ScanReport
 from gdptlab.pipeline.settings import choose_settings
-from gdptlab.plots.knobs import Knobs, panel
 
 
 @pytest.fixture(autouse=True)
@@ -55,30 +54,3 @@ def test_depth_against_truth() -> None:
     pairs = pd.DataFrame({"z_um": [1.0, 2.0], "dz_um": [0.5, -0.5]})
     dots = plots.depth_against_truth({"a": pairs}).axes[0].get_lines()[1]
     np.testing.assert_allclose(dots.get_xydata(), [[1, 1.5], [2, 1.5]])
-
-
-def test_knobs_find_what_locate_finds(few, calibration) -> None:
-    knobs = Knobs(few[0], calibration)
-    first = knobs(0.5, 9, True, "correlation")
-    assert first.ndim == 3 and first.shape[2] == 3 and np.ptp(first) > 100
-    assert knobs.table.equals(locate(few[0], calibration))
-    other = knobs(0.99, 5, False, "correlation")
-    assert knobs.table.equals(locate(few[0], calibration.with_subset(5), threshold=0.99, refine=False))
-    assert (other != first).any()
-    np.testing.assert_array_equal(knobs(0.5, 9, True, "correlation").shape, first.shape)
-
-
-def test_panel_draws_anew_when_a_knob_is_turned(few, calibration) -> None:
-    pytest.importorskip("ipywidgets")
-    box = panel(few[0], calibration)
-    threshold, picture = box.children[0].children[0], box.children[2]
-    before = bytes(picture.value)
-    threshold.value = 0.98
-    assert bytes(picture.value) != before and before.startswith(b"\x89PNG")
-    box.close()
-
-
-def test_panel_says_what_it_needs(few, calibration, monkeypatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "ipywidgets", None)
-    with pytest.raises(ImportError, match="pip install ipywidgets"):
-        panel(few[0], calibration)

@@ -34,7 +34,7 @@ def test_in_um():
 
 @pytest.mark.parametrize("um_per_px", [0, -1, np.nan, np.inf, None, "0.65"])
 def test_in_um_refuses(um_per_px):
-    with pytest.raises((TypeError, ValueError), match=r"^um_per_px: got"):
+    with pytest.raises((TypeError, ValueError), match=r"^um_per_px: "):
         in_um(PARTICLES, um_per_px)
 
 
@@ -73,11 +73,11 @@ def test_save_table(calibration, few, tmp_path, suffix):
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"table": [1, 2]}, TypeError, "^table: got a list"),
-        ({"path": 3}, TypeError, "^path: got a int"),
-        ({"path": "a.xlsx"}, ValueError, "^path: got 'a.xlsx', allowed are names that end in .csv or .parquet"),
-        ({"path": "absent/a.csv"}, FileNotFoundError, "^path must lie in a folder that exists"),
-        ({"calibration": None}, TypeError, "^calibration: got a NoneType"),
+        ({"table": [1, 2]}, TypeError, "^table: "),
+        ({"path": 3}, TypeError, "^path: "),
+        ({"path": "a.xlsx"}, ValueError, "^path: "),
+        ({"path": "absent/a.csv"}, FileNotFoundError, "^path"),
+        ({"calibration": None}, TypeError, "^calibration: "),
         ({"mask": np.ones(3)}, (TypeError, ValueError), "^settings: got .*mask"),
     ],
 )
@@ -123,11 +123,11 @@ def test_no_points(tmp_path, program):
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"table": None}, TypeError, "^table: got a NoneType"),
-        ({"table": PARTICLES.drop(columns="y_px")}, ValueError, r"^table: got no column \['y_px'\]"),
-        ({"path": "a.tsv"}, ValueError, "^path: got 'a.tsv'"),
-        ({"program": "excel"}, ValueError, "^program: got 'excel', allowed are 'napari', 'imagej'"),
-        ({"um_per_px": 0}, ValueError, "^um_per_px: got 0"),
+        ({"table": None}, TypeError, "^table: "),
+        ({"table": PARTICLES.drop(columns="y_px")}, ValueError, r"^table: "),
+        ({"path": "a.tsv"}, ValueError, "^path: "),
+        ({"program": "excel"}, ValueError, "^program: "),
+        ({"um_per_px": 0}, ValueError, "^um_per_px: "),
     ],
 )
 def test_points_refused(tmp_path, monkeypatch, changes, error, message):

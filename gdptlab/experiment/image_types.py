@@ -18,20 +18,26 @@ particle of the default microscope. Below that peak, images would be cut off at 
 
 AMPLITUDE = 400.0
 """Amplitude, counts, of the sinusoid in a disturbed image: 2 % of `WHITE`, ten times the default read noise. The paper
-gives none. Chosen on 4 frames of 50 particles (seed 5; calibration stack and frames disturbed; periods as `PERIOD_PX`):
+gives none. Chosen, together with `PERIOD_PX`, on 4 frames of 50 particles anywhere (seed 5) and 6 frames of 54 isolated
+particles (seed 72), the calibration stack as disturbed as the frames:
 
-    counts    correlation: recall, precision    joint fit: recall, precision, RMS error of z
-    80        0.54, 0.93                        1.00, 1.00, 0.33 µm
-    400       0.53, 0.92                        1.00, 1.00, 0.94 µm
-    600       0.49, 0.88                        1.00, 1.00, 1.34 µm
-    1000      0.46, 0.89                        1.00, 0.98, 1.86 µm
+    counts   periods, px    anywhere                                       isolated
+                            correlation          joint fit                 correlation
+                            recall, precision    recall, RMS error of z    found, RMS error of z
+    80       512, 384       0.54, 0.93           1.00, 0.33 µm             324 of 324, 0.4 µm
+    400      1024, 768      0.54, 0.93           1.00, 0.27 µm             324 of 324, 0.7 µm
+    600      1024, 768                                                     324 of 324, 1.1 µm
+    1000     1024, 768      0.54, 0.94           1.00, 0.30 µm             319 of 324, 2.2 µm
+    400      512, 384       0.53, 0.92           1.00, 0.94 µm             317 of 324, 2.3 µm
+    400      256, 192       0.45, 0.84           0.86, 2.99 µm
 
-80 counts (0.4 %) can hardly be seen; with 1000 (5 %), the dimmest particles are lost in the disturbance."""
+80 counts (0.4 %) can hardly be seen. With more counts, or shorter periods, the curved illumination in the stack moves
+the correlation's z of the dimmest particles, by 1 µm (400 counts) to 4 µm (1000) at z = 40 µm."""
 
-PERIOD_PX = (512.0, 384.0)
-"""Periods, px, of the sinusoid in a disturbed image along x and y. The paper gives none. Chosen as `AMPLITUDE`: with
-periods of 256 and 192 px and 400 counts, the correlation has recall 0.45 and precision 0.84, the joint fit 0.86 and
-0.73; much longer periods are the slopes that each template has removed anyway."""
+PERIOD_PX = (1024.0, 768.0)
+"""Periods, px, of the sinusoid in a disturbed image along x and y: a frame of 512 x 512 px shows half of one and two
+thirds of the other. The paper gives none. Chosen with `AMPLITUDE`: at half of these periods the correlation loses
+isolated particles, at a quarter the joint fit fails; much longer ones are slopes, which the templates do not see."""
 
 
 def fluorescent(light: NDArray) -> NDArray:

@@ -10,6 +10,7 @@ Depths are in µm, z = 0 at the middle of the measured volume, larger z farther 
 
 import hashlib
 import os
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from scipy.stats import qmc
 
 from gdptlab._checks import number, positive, whole
 from gdptlab._compiled import on_one_core
-from gdptlab._files import cache_folder, kept_arrays, written_whole
+from gdptlab._files import cache_folder, keep_arrays, kept_arrays
 from gdptlab.experiment.camera import Camera
 from gdptlab.experiment.image_types import as_image_type
 
@@ -44,9 +45,10 @@ linearly. Chosen at four depths from -35 to 0 µm, half-way between two diameter
 traced directly, over the RMS of that image, rises from 0.8-0.9 % (the noise of 2^20 rays alone) to 0.8-1.0 % with
 1.1, 1.6-2.5 % with 1.2 and 2.6-4.7 % with 1.3. Nearer to 1, more diameters are traced, each for some 10 s."""
 
-LIBRARIES_IN_MEMORY = 8
-"""Number of traced libraries that stay in memory, some 90 MB each. Chosen: diameters that differ by 10 % (standard
-deviation) need 6 to 8. With fewer, each frame reads libraries again, for some 2 s each."""
+LIBRARIES_IN_MEMORY = 10
+"""Number of traced libraries that stay in memory, some 90 MB each. Chosen: a frame of 50 particles whose diameters
+differ by 10 % (standard deviation) needs 6 to 9 (20 draws). With fewer, each frame reads libraries from the disk again,
+some seconds each; with more, rare diameters hold memory."""
 
 LIBRARIES_ON_DISK = 16
 """Number of traced libraries that stay in the cache folder, 24 MB each; those unused for longest are removed. Chosen:
@@ -440,11 +442,11 @@ def _library(microscope: Microscope, diameter_um: float) -> Library:
     z_um, fine = _traced_library(microscope, diameter_um)
     fine = fine.astype(np.float16)
     if path:
-        with written_whole(path) as temporary:
-            np.savez_compressed(temporary, z_um=z_um, fine=fine)
-        files = sorted(folder.glob("particle-images-*.npz"), key=lambda file: file.stat().st_mtime)
-        for unused in files[:-LIBRARIES_ON_DISK]:
-            unused.unlink(missing_ok=True)
+        keep_arrays(path, {"z_um": z_um, "fine": fine})
+        with suppress(OSError):  # another process may remove the same files
+            files = sorted(folder.glob("particle-images-*.npz"), key=lambda file: file.stat().st_mtime)
+            for unused in files[:-LIBRARIES_ON_DISK]:
+                unused.unlink()
     return Library(z_um, fine.astype(np.float32))
 
 

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from gdptlab._checks import positive, whole
-from gdptlab._files import kept_arrays, sources_folder, written_whole
+from gdptlab._files import keep_arrays, kept_arrays, sources_folder
 from gdptlab._versions import versions
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
@@ -185,8 +185,7 @@ def evaluate(
     for i, *pieces in zip(missing, *parts, strict=True):
         tables[i] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
         if paths[i]:
-            with written_whole(paths[i]) as temporary:
-                np.savez_compressed(temporary, **tables[i])
+            keep_arrays(paths[i], tables[i])
     return [pd.DataFrame(table) for table in tables]
 
 

@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "beads": ["ScanReport", "find_beads"],
         "quality": ["depth_quality", "report"],
         "settings": ["Settings", "choose_settings"],
+        "measuring": ["Measured", "measure"],
         "stream": ["batch_to_parquet"],
         "tables": ["in_um", "save_points", "save_table"],
     },

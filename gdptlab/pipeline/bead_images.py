@@ -15,13 +15,30 @@ from gdptlab.calibration import levelled
 from gdptlab.denoising import denoised, noise_level
 
 LARGEST = 121
-"""Rows and columns, px, beyond which no size is chosen for a template unasked."""
+"""Largest size of a template, px, that is chosen unasked in frames of 500 px; see `largest_size`. Chosen: twice that of
+the paper's, and four times that of the planar beads; time to calibrate grows with its square."""
 
 RECENTRED = 4
-"""How often, at most, a particle is cut out anew about the centre that was found."""
+"""Largest number of times that a particle is cut out anew about the centre that was found. Derived: each time the first
+guess may be off by half an image's width, and hardly any particle needs a second."""
 
 STANDS_OUT = 4.0
-"""Height of a particle, over the noise of a pixel, from which on it is one."""
+"""Height of a particle, in standard deviations of a pixel's noise, from which on it is one. Derived: the highest of the
+thousand pixels of a window without a particle, denoised, stays below 4."""
+
+RIM = 0.06
+"""Brightness of a ring, as a fraction of the brightest, below which an image has ended. Chosen on the planar and the
+synthetic scan between 0.03 and 0.12, where templates have 37, 35, 33 and 79, 71, 45 px: the larger lose particles in a
+crowd and at the border, the smaller cut off faint rings that tell depths apart."""
+
+MARGIN = 8
+"""Margin about a window that is moved, px, for the spline and for a particle that drifts. Derived: a cubic spline's
+response falls by 0.27 from pixel to pixel, to 3e-5 over 8."""
+
+
+def largest_size(shape: tuple[int, int]) -> int:
+    """Largest size of a template that is chosen unasked: `LARGEST`, or in large frames a quarter of a side, odd."""
+    return max(LARGEST, min(shape) // 8 * 2 + 1)
 
 
 @on_one_core
@@ -54,7 +71,7 @@ def stack_of_bead(
         if room < 1:
             raise ValueError(f"x_px, y_px: got {where}, allowed is one 3 px or more inside")
         if given is None:
-            half = min(room, LARGEST // 2)
+            half = min(room, largest_size((rows, columns)) // 2)
             size = image_size(cut_out(scan, x_px, y_px, half))
             if size >= 2 * half - 1 and half == room:
                 raise ValueError(f"x_px, y_px: got {where}, whose images reach the border: allowed is one inside")
@@ -84,6 +101,7 @@ def _must_stand_out(stack: NDArray[np.float32], where: str) -> None:
 
 
 def cut_out(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
+    """Part (N, 2 half + 1, 2 half + 1) of a scan about a position."""
     x, y = round(x_px), round(y_px)
     return scan[:, y - half : y + half + 1, x - half : x + half + 1]
 
@@ -91,9 +109,9 @@ def cut_out(scan: NDArray, x_px: float, y_px: float, half: int) -> NDArray:
 def centred(
     scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int, room: int
 ) -> tuple[NDArray, NDArray[np.float64]]:
-    """Images (N, size, size) with the particle on the middle pixel, and where it was, (x, y) in (N, 2)."""
+    """Images (N, size, size) with the particle on the middle pixel, and its positions (x, y) before, (N, 2)."""
     centres = _centres(scan, z_um, x_px, y_px, size)
-    margin = min(room + 2 - size // 2, 16)  # for the spline, and for a particle that drifts
+    margin = min(room + 2 - size // 2, 2 * MARGIN)
     stack = [
         shift_image(image, (round(y_px) - y, round(x_px) - x), order=3, mode="nearest")
         for image, (x, y) in zip(cut_out(scan, x_px, y_px, size // 2 + margin), centres, strict=True)
@@ -101,30 +119,30 @@ def centred(
     return np.stack(stack)[:, margin:-margin, margin:-margin], centres
 
 
-def image_size(cut: NDArray, faint: float = 0.06) -> int:
+def image_size(cut: NDArray) -> int:
     """Smallest odd size that holds the particle in nearly every slice of (N, 2 r + 1, 2 r + 1).
 
     An image ends where the median over a ring about the centre, which a neighbour does not move, first falls
-    below the fraction `faint` of the brightest ring's.
+    below the fraction `RIM` of the brightest ring's.
     """
     half = cut.shape[-1] // 2
     y, x = np.indices(cut.shape[1:]) - half
     ring = np.rint(np.hypot(x, y)).astype(int)
-    reach = []
+    radius = []
     for image in denoised(cut):
-        light = image - np.median(np.concatenate([image[[0, -1]].ravel(), image[:, [0, -1]].ravel()]))
-        profile = np.abs(median(light, ring, np.arange(half + 1)))
+        above = image - np.median(np.concatenate([image[[0, -1]].ravel(), image[:, [0, -1]].ravel()]))
+        profile = np.abs(median(above, ring, np.arange(half + 1)))
         brightest = int(profile.argmax())
-        faint_from = np.flatnonzero(profile[brightest:] < faint * profile[brightest])
-        reach.append(brightest + int(faint_from[0]) if len(faint_from) else half)
-    return 2 * int(np.percentile(reach, 95)) + 1
+        faint = np.flatnonzero(profile[brightest:] < RIM * profile[brightest])
+        radius.append(brightest + int(faint[0]) if len(faint) else half)
+    return 2 * int(np.percentile(radius, 95)) + 1
 
 
 def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) -> NDArray[np.float64]:
     """Centre (x, y) of the particle in every slice, (N, 2), px."""
     cut = levelled(cut_out(scan, x_px, y_px, size // 2).astype(np.float32))
     smooth = denoised(cut)
-    weight = np.einsum("kij,kij->k", smooth, smooth)  # of the particle's light, not of the noise
+    weight = np.einsum("kij,kij->k", smooth, smooth)  # of the particle, not of the noise
     if not weight.all():
         blank = np.flatnonzero(weight == 0).tolist()
         raise ValueError(f"scan: got frames without contrast around x_px, y_px at {blank}, allowed are frames with it")

@@ -18,49 +18,96 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter, shift
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
+from scipy.stats import median_abs_deviation
 
 from gdptlab._checks import depths, real_array, whole
 from gdptlab._compiled import on_one_core
 from gdptlab.assessment import match
 from gdptlab.calibration import Calibration, levelled
-from gdptlab.correlation import normalised
+from gdptlab.correlation import normalised, vertex
 from gdptlab.denoising import denoised, noise_level
 from gdptlab.locate import locate
-from gdptlab.pipeline.bead_images import LARGEST, centred, image_size
+from gdptlab.pipeline.bead_images import MARGIN, centred, image_size, largest_size
 
 STANDS_OUT = 8.0
-"""Height of a bead's spot above what surrounds it, in standard deviations, from which on it is one."""
+"""Height of a spot above its surroundings, in standard deviations of the smoothed image, from which on it is a bead's.
+Chosen between 4 and 16 on the planar and the synthetic scan, where the same beads are found; below 4 noise is."""
 
 FAINT = 0.1
-"""Fraction of the amplitude of bright beads below which a spot is not taken for a bead."""
+"""Height of a spot, as a fraction of that of bright spots (the 90th percentile), below which it is no bead's. Chosen
+between 0.03 and 0.3 on the planar scan, where 91, 89 and 88 beads are found at 0.03, 0.1 and 0.3."""
 
 MOST_BEADS = 40
-"""Of those that stand alone, the brightest, that are looked at closely."""
+"""Largest number of beads, the brightest of those that stand alone, that are cut out and averaged. Chosen between 10
+and 100 on the planar and the synthetic scan: the RMS error of z changes by 2 % or less, and the time to calibrate grows
+with the number."""
 
-ALIKE = 0.9
-"""Least correlation of a usable bead's images with the average bead's, in the mean over depth."""
+LEAST_CORRELATION = 0.9
+"""Correlation of a bead's images with the average bead's, in the mean over depth, below which it is an outlier. Chosen
+between 0.8 and 0.97 on the planar and the synthetic scan, where the same 15 and 14 beads are used."""
+
+MOST_LAG = 0.1
+"""Largest shift of a bead along z, as a fraction of the scan, to the average bead: one that needs more is an outlier.
+Convention: its images at a tenth of the depths, at one end, would be made up from the slice at the end."""
 
 COVERED = 0.9
-"""Correlation that an image at any depth has, at least, with one of the subset, if the subset is chosen here."""
+"""Correlation that an image at any depth has, at least, with one of the subset, if the subset is chosen here. Chosen:
+the planar and the synthetic scan then get 10 and 6 images; a higher one takes more images, and more time."""
 
+SUBSETS = (5, 25)
+"""Least and largest number of images of a subset that is chosen here. The paper's Figure 5 goes from 3 to 25; time
+grows with their number, and below 5 a profile has too few values to tell depths apart."""
 
 LEAST = 7
-"""Frames of a scan."""
+"""Least number of frames of a scan. Derived: smoothing splines along z need 5, and both ends are left out when beads
+are moved onto each other."""
 
-MOST_APART = 60
-"""Of spots that may belong to one bead, px."""
+FINEST_PX, COARSEST_PX = 1.0, 4.0
+"""Standard deviations of the filters, px, between which a spot is counted as sharp: spots of half-widths of about 1 to
+5 px. Derived: the spots of the planar beads have 1.4 px, those of the synthetic scan 3.2; below 1 px is a pixel's
+noise."""
 
-SPOT = 10
-"""Rows and columns about a bead's place in which its brightest spot is looked for."""
+SHARPEST = 1 / 40
+"""Slices to either side of the sharpest, as a fraction of the scan, that are averaged to look for beads. Derived: none
+in a scan of fewer than 40 slices; in one of 106, two, over which beads change little."""
 
-SAME = 2.0
-"""Radius, px, within which the steps from spot to spot are the same."""
+MEASURED = 20
+"""Number of the brightest spots whose half-width is measured. Convention: their median is known to a fifth of the
+scatter of one."""
+
+WIDEST = 30
+"""Largest half-width of a spot, px, that is measured. Derived: a spot in focus that is wider would need templates, a
+few times as wide in all directions, larger than half a camera's frame."""
+
+MOST_APART = 20.0
+"""Largest distance of spots that may belong to one bead, in half-widths of a spot. Derived: two lobes that defocus
+opens lie a few half-widths apart in focus (eight in the tests); templates have about twenty."""
+
+SPOT = 4.0
+"""Half-width of the window about a bead in which its brightest spot is looked for, in half-widths of a spot. Derived: a
+bead's middle may lie between two lobes, half of eight half-widths from either."""
+
+SAME = 1.0
+"""Radius within which steps from spot to spot are the same, in half-widths of a spot. Derived: each centroid is known
+to a fraction of one; a larger radius lets more steps be the same by chance."""
 
 FRACTIONS = (1.0, 0.9, 0.8, 0.7)
-"""Of the widest image, tried as the size of a template."""
+"""Sizes of a template that are tried, as fractions of the widest image. Below 0.7 little of the widest images is left,
+by which depths far from focus are told apart."""
 
 CHECKED = 7
-"""Slices of the scan in which beads are looked for, to choose that size."""
+"""Number of slices of the scan, evenly spread, in which beads are looked for to choose that size. Derived: they hold a
+few hundred beads, so that `MORE` stands out; the time grows with their number."""
+
+RIGHT = 0.02
+"""Largest error of z, as a fraction of the range of depths, of a bead that counts as found. As in `quality.ERROR`."""
+
+MORE = 1.05
+"""Ratio of beads found from which on a smaller template is better. Derived: of a few hundred, twenty more."""
+
+NEAR_END = 0.02
+"""Part of the camera's range, next to its end, that has fewer pixels than the very end if beads are clipped. Derived:
+of images that are not clipped the fewest pixels are the brightest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +119,11 @@ class ScanReport:
     beads : DataFrame
         A row for each bead of the scan: `x_px`, `y_px`; `amplitude`, the height of its spot (counts);
         `room_px`, the distance to its nearest neighbour or, doubled, to the border; for those looked at closely
-        also `clipped`, in how many slices it is cut off at the top or bottom of the camera's range, `alike`, the
-        correlation with the average bead, and `offset_um`, how much higher (in z of the scan) than the others it comes
-        into focus; `verdict`: "used", or why it is not.
+        also `clipped`, in how many slices it is cut off at the top or bottom of the camera's range, `correlation`, that
+        with the average bead, and `offset_um`, how much higher (in z of the scan) than the others it comes into focus;
+        `verdict`: "used", or why it is not.
     drift_px : float64 array (N, 2)
-        Where the average bead is in each slice (x, y), from its mean place.
+        Position (x, y) of the average bead in each slice, from its mean position.
     clipped : float64 array (N,)
         Fraction of the beads looked at that are clipped in each slice.
     settings : DataFrame
@@ -135,50 +182,47 @@ def averaged_beads(
         raise ValueError(f"size: got {size} px, allowed are odd sizes")
     if n_sub is not None:
         whole("n_sub", n_sub, 2, len(scan))
-    overview = _sharpest(scan)
-    if beads_px is None:
-        beads = _found(overview)
-    else:
-        beads_px = real_array("beads_px", beads_px, 2)
-        if beads_px.shape[1] != 2:
-            raise ValueError(f"beads_px: got shape {beads_px.shape}, allowed is (n, 2): x and y of each bead")
-        beads = _table(overview, beads_px.astype(float))
-    chosen = size or _size(scan, beads)
-    beads, stack, drift, clipped = _averaged(scan, z_um, beads, chosen, given=beads_px is not None)
-    if size is None and beads_px is None:
+    overview, given = _sharpest(scan), beads_px is not None
+    beads = _table(overview, _given(beads_px)) if given else _found(overview)
+    widest = size or _size(scan, beads)
+    beads, stack, drift, clipped = _averaged(scan, z_um, beads, widest, given=given)
+    if size is None and not given:
         stack = _fitting(stack, scan, z_um, beads)
     calibration = Calibration.from_stack(stack, z_um, n_sub=n_sub or min(9, len(scan)))
     if n_sub is None:
         calibration = calibration.with_subset(_subset_size(calibration))
-    used = (beads["verdict"] == "used").sum()
-    how = {False: "by itself", True: "given"}
-    settings = pd.DataFrame(
-        [
-            (
-                "beads",
-                f"{used} of {len(beads)}",
-                how[beads_px is not None],
-                "averaged, whatever they are like"
-                if beads_px is not None
-                else "alone, not clipped and alike; averaged",
-            ),
-            (
-                "size",
-                f"{calibration.size} px",
-                how[size is not None],
-                "" if size else _reason(chosen, calibration.size),
-            ),
-            (
-                "n_sub",
-                f"{len(calibration.subset)} of {len(calibration)}",
-                how[n_sub is not None],
-                f"enough for each depth to be like one of them (C_m {COVERED}), or the most that is tried",
-            ),
-        ],
-        columns=["setting", "value", "how", "why"],
-    ).set_index("setting")
+    settings = _choices(
+        calibration, beads, widest, {"beads": given, "size": size is not None, "n_sub": n_sub is not None}
+    )
     noise = max(noise_level(scan[:: max(len(scan) // 5, 1)]), 1e-9)
     return replace(calibration, report=ScanReport(beads, drift, clipped, settings, overview, noise))
+
+
+def _given(beads_px: ArrayLike) -> NDArray[np.float64]:
+    """Positions (n, 2) of beads, x and y in px, if they are that."""
+    positions = real_array("beads_px", beads_px, 2).astype(float)
+    if positions.shape[1] != 2:
+        raise ValueError(f"beads_px: got shape {positions.shape}, allowed is (n, 2): x and y of each bead")
+    return positions
+
+
+def _choices(calibration: Calibration, beads: pd.DataFrame, widest: int, given: dict[str, bool]) -> pd.DataFrame:
+    """Table of what was chosen, and why, by the name of the choice; or `given`."""
+    used = (beads["verdict"] == "used").sum()
+    averaged = "whatever they are like" if given["beads"] else "alone, not clipped and no outliers"
+    size = "just holds the widest image of a bead"
+    if calibration.size < widest:
+        size = f"the widest image has {widest} px, but with this more of the scan's beads are found at their depth"
+    table = {
+        "beads": (f"{used} of {len(beads)}", f"averaged: {averaged}"),
+        "size": (f"{calibration.size} px", "" if given["size"] else size),
+        "n_sub": (
+            f"{len(calibration.subset)} of {len(calibration)}",
+            f"each depth then correlates with one of them by {COVERED} or more, or it is the most that is tried",
+        ),
+    }
+    rows = [(value, "given" if given[name] else "by itself", why) for name, (value, why) in table.items()]
+    return pd.DataFrame(rows, columns=["value", "how", "why"], index=pd.Index(table, name="setting"))
 
 
 def _checked(scan: ArrayLike, z_um: ArrayLike) -> tuple[NDArray, NDArray[np.float64]]:
@@ -198,7 +242,7 @@ def _checked(scan: ArrayLike, z_um: ArrayLike) -> tuple[NDArray, NDArray[np.floa
 
 
 def _sharpest(scan: NDArray) -> NDArray[np.float32]:
-    """What stands out of the mean over z in the slices about the sharpest, bright beads above 0, dark ones below."""
+    """Sharpest slices of (N, rows, columns) less the mean over z: bright beads are above 0, dark ones below."""
     mean = np.zeros(scan.shape[1:])
     levels = np.empty(len(scan), dtype=np.float32)
     for k, image in enumerate(scan):
@@ -208,91 +252,110 @@ def _sharpest(scan: NDArray) -> NDArray[np.float32]:
     mean = (mean / len(scan)).astype(np.float32)
     contrast = np.empty(len(scan))
     for k, image in enumerate(scan):
-        smooth = gaussian_filter(image - levels[k] - mean, 1)
-        contrast[k] = ((smooth - gaussian_filter(smooth, 4)) ** 4).mean()  # small and strong, not large and weak
+        smooth = gaussian_filter(image - levels[k] - mean, FINEST_PX)
+        # The fourth power is large for spots that are small and strong, not for those that are large and weak.
+        contrast[k] = ((smooth - gaussian_filter(smooth, COARSEST_PX)) ** 4).mean()
     if not contrast.max() > 0:
-        raise ValueError("scan: got frames that are all alike, needed are beads that change with z")
-    best, reach = int(contrast.argmax()), len(scan) // 40
-    near = slice(max(best - reach, 0), best + reach + 1)
+        raise ValueError("scan: got frames that are all the same, needed are beads that change with z")
+    best, half = int(contrast.argmax()), int(SHARPEST * len(scan))
+    near = slice(max(best - half, 0), best + half + 1)
     return np.mean(scan[near] - levels[near, None, None], axis=0, dtype=np.float32) - mean
 
 
 def _found(overview: NDArray[np.float32]) -> pd.DataFrame:
-    """Table of the spots in `overview`."""
+    """Table of the beads in `overview` (rows, columns)."""
     sign = 1 if (overview**3).mean() > 0 else -1
     spots, width = gaussian_filter(sign * overview, 1), 1.0
     for _ in range(2):  # with a first guess of how wide spots are, then with their width
-        reach = 2 * int(np.ceil(width)) + 3
-        highest = spots == maximum_filter(spots, 2 * reach + 1)
+        half = 2 * int(np.ceil(width)) + 3
+        highest = spots == maximum_filter(spots, 2 * half + 1)
         level = np.median(spots)
-        noise = 1.4826 * np.median(np.abs(spots - level))
+        noise = median_abs_deviation(spots, axis=None, scale="normal")
         y, x = np.nonzero(highest & (spots > level + STANDS_OUT * noise))
         if not len(x):
             raise ValueError("scan: got one in which nothing stands out of the noise, needed are beads")
         height = spots[y, x] - level
         bright = height > FAINT * np.percentile(height, 90)
         x, y = x[bright], y[bright]
-        top = np.argsort(-spots[y, x])[:20]
-        width = float(np.median([_half_width(sign * overview, x[i], y[i]) for i in top]))
+        width = _half_width(sign * overview, np.stack([x, y], axis=1)[np.argsort(-spots[y, x])])
         spots = gaussian_filter(sign * overview, max(1, width / 2))
-    places = np.array([_centroid(sign * overview, *place, 1 + int(width)) for place in zip(x, y, strict=True)])
-    bead = _bead_of(places)
+    spot = np.array([_centroid(sign * overview, *at, 1 + int(width)) for at in zip(x, y, strict=True)])
+    bead = _bead_of(spot, width)
     weight = spots[y, x] - level
     total = np.bincount(bead, weight)
-    return _table(overview, np.stack([np.bincount(bead, weight * p) / total for p in places.T], axis=1))
+    return _table(overview, np.stack([np.bincount(bead, weight * p) / total for p in spot.T], axis=1), width)
 
 
-def _bead_of(places: NDArray) -> NDArray[np.int64]:
-    """Number of the bead that each spot at `places` (n, 2) belongs to.
+def _bead_of(spots: NDArray, width: float) -> NDArray[np.int64]:
+    """Number of the bead that each of the spots at (n, 2), of this half-width, belongs to; (n,).
 
     A step from spot to spot that a fifth of them or more share, far more often than by chance, leads from one spot of
     a bead to another. In a regular array of beads a step leads on to a third one, and is not taken.
     """
-    pairs = KDTree(places).query_pairs(MOST_APART, output_type="ndarray")
-    steps = places[pairs[:, 1]] - places[pairs[:, 0]]
+    pairs = KDTree(spots).query_pairs(MOST_APART * width, output_type="ndarray")
+    steps = spots[pairs[:, 1]] - spots[pairs[:, 0]]
     by_chance = 2 * len(steps) * (SAME / MOST_APART) ** 2
     joined = np.zeros(len(pairs), dtype=bool)
     either_way = KDTree(np.concatenate([steps, -steps])) if len(steps) else None
     for step in steps:
-        same = np.unique(np.array(either_way.query_ball_point(step, SAME)) % len(steps))
-        spots = np.unique(pairs[same])
-        if len(same) >= max(3, len(places) / 5, 10 * by_chance) and len(spots) > 1.8 * len(same):
+        same = np.unique(np.array(either_way.query_ball_point(step, SAME * width)) % len(steps))
+        ends = np.unique(pairs[same])
+        if len(same) >= max(3, len(spots) / 5, 10 * by_chance) and len(ends) > 1.8 * len(same):
             joined[same] = True
-    links = coo_array((np.ones(joined.sum()), pairs[joined].T), shape=(len(places), len(places)))
+    links = coo_array((np.ones(joined.sum()), pairs[joined].T), shape=(len(spots), len(spots)))
     return connected_components(links, directed=False)[1]
 
 
-def _half_width(spot: NDArray, x: int, y: int, most: int = 30) -> float:
-    """Radius (px) of the round spot that has as many pixels above half its height."""
-    cut = spot[max(y - most, 0) : y + most + 1, max(x - most, 0) : x + most + 1]
-    return float(np.sqrt((cut > spot[y, x] / 2).sum() / np.pi))
+def _half_width(image: NDArray, spots: NDArray) -> float:
+    """Median radius (px) of the first `MEASURED` spots at (n, 2), x and y: of a disc that has as many pixels as one
+    has above half its height."""
+    widths = []
+    for x, y in np.rint(spots[:MEASURED]).astype(int):
+        cut = image[max(y - WIDEST, 0) : y + WIDEST + 1, max(x - WIDEST, 0) : x + WIDEST + 1]
+        widths.append(np.sqrt((cut > image[y, x] / 2).sum() / np.pi))
+    return float(np.median(widths))
 
 
-def _centroid(spot: NDArray, x: int, y: int, reach: int) -> tuple[float, float]:
-    top, left = max(y - reach, 0), max(x - reach, 0)
-    cut = np.clip(spot[top : y + reach + 1, left : x + reach + 1], 0, None)
+def _centroid(image: NDArray, x: int, y: int, half: int) -> tuple[float, float]:
+    """Centroid (x, y) of what is above 0 in a window of an image, `half` px to all sides of a pixel."""
+    top, left = max(y - half, 0), max(x - half, 0)
+    cut = np.clip(image[top : y + half + 1, left : x + half + 1], 0, None)
     rows, columns = np.indices(cut.shape)
     return left + (cut * columns).sum() / cut.sum(), top + (cut * rows).sum() / cut.sum()
 
 
-def _table(overview: NDArray[np.float32], places: NDArray) -> pd.DataFrame:
-    """Beads at `places` (n, 2), brightest first."""
+def _highest_near(image: NDArray, positions: NDArray) -> NDArray[np.int64]:
+    """Highest pixels (n, 2), x and y, of an image within `WIDEST` px of positions (n, 2)."""
+    highest = []
+    for x, y in np.rint(positions).astype(int):
+        top, left = max(y - WIDEST, 0), max(x - WIDEST, 0)
+        cut = image[top : y + WIDEST + 1, left : x + WIDEST + 1]
+        row, column = np.unravel_index(cut.argmax(), cut.shape)
+        highest.append((left + column, top + row))
+    return np.array(highest)
+
+
+def _table(overview: NDArray[np.float32], positions: NDArray, width: float | None = None) -> pd.DataFrame:
+    """Table of beads at `positions` (n, 2), x and y, brightest first; their spots have this half-width, px."""
     y_end, x_end = np.array(overview.shape) - 1
-    x, y = places.T
+    x, y = positions.T
     border = np.min([x, y, x_end - x, y_end - y], axis=0)
     if (border < 0).any():
-        raise ValueError(f"beads_px: got {places[border.argmin()]}, allowed are places in the frames")
-    nearest = KDTree(places).query(places, k=2)[0][:, 1]
+        raise ValueError(f"beads_px: got {positions[border.argmin()]}, allowed are positions in the frames")
+    nearest = KDTree(positions).query(positions, k=2)[0][:, 1]
     column, row = (np.rint(p).astype(int) for p in (x, y))
     smooth = gaussian_filter(overview, 1)
-    high, low = (extreme(smooth, 2 * SPOT + 1)[row, column] for extreme in (maximum_filter, minimum_filter))
+    if width is None:
+        width = _half_width(np.abs(overview), _highest_near(np.abs(overview), positions))
+    side = 2 * int(np.ceil(SPOT * width)) + 1
+    high, low = (extreme(smooth, side)[row, column] for extreme in (maximum_filter, minimum_filter))
     height = np.where(high > -low, high, low)
     table = pd.DataFrame({"x_px": x, "y_px": y, "amplitude": height, "room_px": np.minimum(nearest, 2 * border)})
     return table.sort_values("amplitude", key=np.abs, ascending=False, ignore_index=True)
 
 
 def _window(scan: NDArray, x_px: float, y_px: float, half: int) -> tuple[NDArray[np.float32], float, float]:
-    """Part of the scan about a place, and where in it the place is."""
+    """Part of the scan (N, rows, columns) about a position, and the position (x, y) in it."""
     x, y = round(x_px), round(y_px)
     top, left = max(y - half, 0), max(x - half, 0)
     return scan[:, top : y + half + 1, left : x + half + 1].astype(np.float32), x_px - left, y_px - top
@@ -301,7 +364,7 @@ def _window(scan: NDArray, x_px: float, y_px: float, half: int) -> tuple[NDArray
 def _size(scan: NDArray, beads: pd.DataFrame) -> int:
     """Median of the sizes that hold the widest image of the beads with most room."""
     bright = beads[beads["amplitude"].abs() > beads["amplitude"].abs().median() / 2]
-    half = np.minimum(bright["room_px"] // 2 - 1, LARGEST // 2).nlargest(5).astype(int)
+    half = np.minimum(bright["room_px"] // 2 - 1, largest_size(scan.shape[1:]) // 2).nlargest(5).astype(int)
     half = half[half >= max(2, 0.8 * half.max())]  # less would cut a wide image off
     if half.empty:
         raise ValueError("scan: got no bead with room around it, needed is one, wholly in the frame")
@@ -315,7 +378,7 @@ def _fitting(stack: NDArray, scan: NDArray, z_um: NDArray, beads: pd.DataFrame) 
     A smaller template leaves out what is faint, but also the neighbours. The joint fit has no such need, and is
     tried with the whole images first.
     """
-    n, within_um = stack.shape[1], (z_um[-1] - z_um[0]) / 50
+    n, within_um = stack.shape[1], RIGHT * (z_um[-1] - z_um[0])
     looked = np.rint(np.linspace(0, len(scan) - 1, CHECKED + 2)[1:-1]).astype(int)
     true = pd.concat([beads[["x_px", "y_px"]].assign(frame=k, z_um=z_um[k]) for k in looked], ignore_index=True)
     best, most = stack, 0.0
@@ -326,15 +389,9 @@ def _fitting(stack: NDArray, scan: NDArray, z_um: NDArray, beads: pd.DataFrame) 
         found = [locate(scan[k], calibration, method=method).assign(frame=k) for k in looked]
         found = pd.concat(found, ignore_index=True)
         right = len(match(found, true, within_px=max(2, n / 10), within_um=within_um))
-        if right > 1.05 * most:  # not for one bead more or less
+        if right > MORE * most:
             best, most = cut, right
     return best
-
-
-def _reason(widest: int, size: int) -> str:
-    if size == widest:
-        return "just holds the widest image of a bead"
-    return f"the widest image has {widest} px, but with this more of the scan's beads are found at their depth"
 
 
 def _averaged(
@@ -343,20 +400,20 @@ def _averaged(
     """Beads with a verdict each, their average stack, its drift (N, 2), and the fraction clipped in each slice."""
     beads = beads.assign(
         clipped=np.nan,
-        alike=np.nan,
+        correlation=np.nan,
         offset_um=np.nan,
         verdict=f"too near to another or the border: not {size} px of room",
     )
     end = np.array(scan.shape[:0:-1]) - 1
-    places = beads[["x_px", "y_px"]].to_numpy()
-    inside = 2 * np.minimum(places, end - places).min(axis=1)
+    positions = beads[["x_px", "y_px"]].to_numpy()
+    inside = 2 * np.minimum(positions, end - positions).min(axis=1)
     alone = (inside >= size + 4) & (given | (beads["room_px"].to_numpy() >= size))
     beads.loc[alone, "verdict"] = "not looked at: others are brighter"
     looked = beads.index[alone] if given else beads.index[alone][:MOST_BEADS]
     if not len(looked):
         raise ValueError(
             f"scan: got {len(beads)} beads, none with {size} px to the next and {size // 2 + 2} to the border, needed "
-            "is one; give a smaller size, or the place of one in beads_px (also if one bead's spots are taken "
+            "is one; give a smaller size, or the position of one in beads_px (also if one bead's spots are taken "
             "for several), or scan a sparser slide"
         )
     clipped = _clipped(scan, beads.loc[looked], size)
@@ -368,22 +425,22 @@ def _averaged(
     kept = looked[sound]
     stacks, drifts = [], []
     for bead in beads.loc[kept].itertuples():
-        window, x, y = _window(scan, bead.x_px, bead.y_px, size // 2 + 8)
+        window, x, y = _window(scan, bead.x_px, bead.y_px, size // 2 + MARGIN)
         room = int(min(x, y, window.shape[2] - 1 - x, window.shape[1] - 1 - y)) - 2
         stack, centres = centred(window, z_um, x, y, size, room)
         stacks.append(stack)
         drifts.append(centres - (x, y))
-    mean, alike, lags, used = _mean(np.array(stacks), given)
-    beads.loc[kept, "alike"], beads.loc[kept, "offset_um"] = alike, -lags * np.median(np.diff(z_um))
-    beads.loc[kept, "verdict"] = np.where(used, "used", "unlike the others")
+    mean, correlation, lags, used = _mean(np.array(stacks), given)
+    beads.loc[kept, "correlation"], beads.loc[kept, "offset_um"] = correlation, -lags * np.median(np.diff(z_um))
+    beads.loc[kept, "verdict"] = np.where(used, "used", "an outlier")
     drift = np.mean(np.array(drifts)[used], axis=0)
     return beads, mean, drift - drift.mean(axis=0), clipped.mean(axis=0)
 
 
 def _mean(stacks: NDArray, given: bool) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Average of stacks (b, N, n, n), each moved along z to fit the rest; how alike each is, its lag, and if used.
+    """Average (N, n, n) of stacks (b, N, n, n), each moved along z; their correlation with it, lags, and if used, (b,).
 
-    Stacks count as they are bright, so that the average has the least noise; it has the amplitude of the median.
+    Stacks are weighted by their amplitude, so that the average has the least noise; it has the amplitude of the median.
     """
     smooth = np.array([normalised(levelled(denoised(stack))) for stack in stacks])
     lags, used = np.zeros(len(stacks)), np.ones(len(stacks), dtype=bool)
@@ -393,50 +450,50 @@ def _mean(stacks: NDArray, given: bool) -> tuple[NDArray, NDArray, NDArray, NDAr
         lags = np.array([_lag(images, model) for images in smooth])
         lags -= np.median(lags[used])
         moved = np.array([shift(stack, (lag, 0, 0), mode="nearest") for stack, lag in zip(stacks, lags, strict=True)])
-        light = levelled(mean)
-        weight = np.linalg.norm(light, axis=(1, 2)) ** 0.5  # dim slices count less, but count
-        like = [
-            np.einsum("kij,kij->k", shift(images, (lag, 0, 0), order=1, mode="nearest"), model)
-            for images, lag in zip(smooth, lags, strict=True)
+        images = levelled(mean)
+        weight = np.linalg.norm(images, axis=(1, 2)) ** 0.5  # dim slices count less, but count
+        each = [
+            np.einsum("kij,kij->k", shift(stack, (lag, 0, 0), order=1, mode="nearest"), model)
+            for stack, lag in zip(smooth, lags, strict=True)
         ]
-        alike = np.average(like, axis=1, weights=weight)
-        used = (alike >= min(ALIKE, np.median(alike))) & (np.abs(lags) <= stacks.shape[1] / 10) | given
-        gain = np.einsum("bkij,kij->b", moved, light) / (light**2).sum()
-        mean = np.einsum("b,bkij->kij", gain[used], moved[used]) * np.median(gain[used]) / (gain[used] ** 2).sum()
-    return mean.astype(np.float32), alike, lags, used
+        correlation = np.average(each, axis=1, weights=weight)
+        typical = correlation >= min(LEAST_CORRELATION, np.median(correlation))
+        used = typical & (np.abs(lags) <= MOST_LAG * stacks.shape[1]) | given
+        amplitude = np.einsum("bkij,kij->b", moved, images) / (images**2).sum()
+        mean = np.einsum("b,bkij->kij", amplitude[used], moved[used])
+        mean *= np.median(amplitude[used]) / (amplitude[used] ** 2).sum()
+    return mean.astype(np.float32), correlation, lags, used
 
 
 def _lag(images: NDArray, model: NDArray) -> float:
-    """Slices by which images (N, n, n) must be moved to be most like those of the model, both normalised."""
-    most = max(len(images) // 10, 1)
-    likeness = np.einsum("kij,lij->kl", images, model)
+    """Slices by which images (N, n, n) are moved to correlate best with those of the model, both normalised."""
+    most = max(int(MOST_LAG * len(images)), 1)
+    correlation = np.einsum("kij,lij->kl", images, model)
     inner = np.arange(most + 1, len(images) - most - 1)  # the same for all lags: the ends may be the noisiest
-    mean = np.array([likeness[inner, inner + lag].mean() for lag in range(-most - 1, most + 2)])
+    mean = np.array([correlation[inner, inner + lag].mean() for lag in range(-most - 1, most + 2)])
     best = 1 + int(mean[1:-1].argmax())
-    before, here, after = mean[best - 1 : best + 2]
-    bend = before + after - 2 * here
-    return best - most - 1 + (np.clip((before - after) / (2 * bend), -0.5, 0.5) if bend < 0 else 0)
+    return best - most - 1 + float(vertex(mean[None, best - 1 : best + 2])[0])
 
 
 def _clipped(scan: NDArray, beads: pd.DataFrame, size: int) -> NDArray[np.bool_]:
     """Whether a bead's image is cut off at the end of the camera's range, (beads, N).
 
-    Then more pixels are at the very end than in the next fiftieth of the range.
+    Then more pixels are at the very end than in the next `NEAR_END` of the range.
     """
     sign = np.sign(beads["amplitude"].median())
     end, other = (scan.max(), scan.min()) if sign > 0 else (scan.min(), scan.max())
-    near = np.abs(scan.astype(np.float32) - float(end)) <= abs(float(end) - float(other)) / 50
+    near = np.abs(scan.astype(np.float32) - float(end)) <= NEAR_END * abs(float(end) - float(other))
     at_end = scan == end
     if at_end.sum() < max(4, near.sum() - at_end.sum()):
         return np.zeros((len(beads), len(scan)), dtype=bool)
     return np.array([_window(at_end, b.x_px, b.y_px, size // 2)[0].any(axis=(1, 2)) for b in beads.itertuples()])
 
 
-def _subset_size(calibration: Calibration, least: int = 5, most: int = 25) -> int:
-    """Fewest images of which, at any depth, one is alike to `COVERED`."""
-    alike = calibration.self_similarity()
-    most = min(most, len(calibration))
-    for n_sub in range(min(least, most), most):
-        if alike[:, calibration.with_subset(n_sub).subset].max(axis=1).min() >= COVERED:
+def _subset_size(calibration: Calibration) -> int:
+    """Fewest images of which, at any depth, one correlates by `COVERED` or more; of `SUBSETS`."""
+    correlation = calibration.self_similarity()
+    least, most = (min(n, len(calibration)) for n in SUBSETS)
+    for n_sub in range(least, most):
+        if correlation[:, calibration.with_subset(n_sub).subset].max(axis=1).min() >= COVERED:
             return n_sub
     return most

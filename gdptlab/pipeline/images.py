@@ -65,14 +65,14 @@ class Images(Sequence):
     def __init__(
         self,
         files: Sequence[File],
-        places: NDArray[np.int64],
+        locations: NDArray[np.int64],
         frame: tuple[tuple[int, int], np.dtype],
         um_per_px: float | None,
     ) -> None:
-        # A row of places is the number of a file, and where in it an image is described or, if the file is raw, begins.
-        used, number_of_file = np.unique(places[:, 0], return_inverse=True)
+        # A row of locations: number of a file, and where in it an image is described or, if the file is raw, begins.
+        used, number_of_file = np.unique(locations[:, 0], return_inverse=True)
         self._files = [files[i] for i in used]
-        self._places = np.stack([number_of_file, places[:, 1]], axis=1)
+        self._locations = np.stack([number_of_file, locations[:, 1]], axis=1)
         self._frame = frame
         self.um_per_px = um_per_px
 
@@ -87,7 +87,7 @@ class Images(Sequence):
     @property
     def names(self) -> list[str]:
         """Name of the file that each image is in."""
-        return [self._files[i].path.name for i in self._places[:, 0]]
+        return [self._files[i].path.name for i in self._locations[:, 0]]
 
     @property
     def paths(self) -> list[Path]:
@@ -99,7 +99,7 @@ class Images(Sequence):
         return f"<{n} images of {rows} by {columns} px, {self.dtype}, in {len(self._files)} files>"
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._locations)
 
     @overload
     def __getitem__(self, index: int) -> NDArray: ...
@@ -110,19 +110,19 @@ class Images(Sequence):
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, tuple):
             raise TypeError(f"index: got {index!r}, allowed is one along the images; what is in them is not read yet")
-        places = self._places[index]
-        if places.ndim == 1:
-            return next(iter(type(self)(self._files, places[None], self._frame, self.um_per_px)))
-        return type(self)(self._files, places, self._frame, self.um_per_px)
+        locations = self._locations[index]
+        if locations.ndim == 1:
+            return next(iter(type(self)(self._files, locations[None], self._frame, self.um_per_px)))
+        return type(self)(self._files, locations, self._frame, self.um_per_px)
 
     def __iter__(self) -> Iterator[NDArray]:
         (rows, columns), dtype = self._frame
-        for file, places in groupby(self._places.tolist(), lambda place: place[0]):
+        for file, locations in groupby(self._locations.tolist(), lambda location: location[0]):
             path, raw, stamp = self._files[file]
             with _opened(path) as tif:
                 if stamp not in (None, _stamp(path)):
                     raise ValueError(f"path: got {path.name!r}, which has changed since it was opened: open it again")
-                for _, offset in places:
+                for _, offset in locations:
                     if raw:
                         tif.filehandle.seek(offset)
                         image = tif.filehandle.read_array(tif.byteorder + dtype.char, rows * columns)
@@ -190,7 +190,7 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
         for name, value in (("channel", channel), ("position", position))
     }
     paths = _paths(Path(path).absolute())
-    number, files, places, frame, um_per_px = {}, [], [], None, None
+    number, files, locations, frame, um_per_px = {}, [], [], None, None
     for path in paths:
         if path in number:  # a part of a set of OME-TIFFs
             continue
@@ -205,14 +205,14 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
         if len(paths) > 1 and not files and len(found) == 1:
             # One image in each of perhaps 100 000 files: they are looked at when they are read.
             files = [File(path, False, None) for path in paths]
-            places = [(i, 0) for i in range(len(paths))]
+            locations = [(i, 0) for i in range(len(paths))]
             break
         for file, offset in found:
             if file not in number:
                 number[file] = len(files)
                 files.append(File(file, raw, _stamp(file)))
-            places.append((number[file], offset))
-    return Images(files, np.array(places, dtype=np.int64), frame, um_per_px)
+            locations.append((number[file], offset))
+    return Images(files, np.array(locations, dtype=np.int64), frame, um_per_px)
 
 
 def open_scan(
@@ -420,7 +420,7 @@ def _series(tif: tifffile.TiffFile, path: Path, position: int | None) -> list[ti
 def _found(
     tif: tifffile.TiffFile, series: list[tifffile.TiffPageSeries], path: Path, channel: int | None
 ) -> tuple[list[tuple[Path, int]], bool]:
-    """File and place of each image of a channel, and whether they lie there raw, one after the other."""
+    """File and location of each image of a channel, and whether they lie there raw, one after the other."""
     raw = series[0].dataoffset
     chosen = [_of_channel(one, path, channel) for one in series]
     if len(series) == 1 and raw is not None and not series[0].is_multifile:
@@ -518,7 +518,10 @@ def _errors_raised(logger: logging.Logger) -> Iterator[None]:
     """Raise what is logged as an error: tifffile only logs that a file is cut off, and returns what is left."""
 
     class Raising(logging.Handler):
+        """Handler that raises."""
+
         def emit(self, record: logging.LogRecord) -> None:
+            """Raise ValueError with what is logged."""
             raise ValueError(record.getMessage())
 
     handler = Raising(logging.ERROR)

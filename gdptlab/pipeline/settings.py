@@ -3,8 +3,8 @@
 The threshold of C_m: how often does what is certainly no particle reach it? In a frame with its sign turned every
 bright particle is dark, so whatever is found there is false: noise, gaps between particles, rings about them. It is
 as noisy and as crowded as the frame itself, so about as many of its finds lie above any C_m as of the frame's own
-that are false for the same reasons. What it does not show are finds on particles: part of a ring may look like a
-whole one from another depth. Such ghosts are counted on the calibration's own images, each alone on noise. The
+that are false for the same reasons. What it does not show are false finds on particles: part of a ring may look like a
+whole one at another depth. Such side-lobes are counted on the calibration's own images, each alone on noise. The
 threshold is the lowest at which both kinds are few. (What it cannot see are particles that come out at a wrong depth.)
 """
 
@@ -16,26 +16,30 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, positive, real_array, whole
+from gdptlab._checks import choice, image_array, positive, whole
 from gdptlab.calibration import Calibration
 from gdptlab.denoising import noise_level
 from gdptlab.fit.pattern import particle_light
 from gdptlab.locate import METHODS, locate
 
 LOWEST = 0.2
-"""C_m from which on finds are counted."""
+"""C_m from which on finds are counted, the least threshold that is chosen. Chosen between 0.1 and 0.3 on the planar
+beads and the sample, whose thresholds stay 0.51 and 0.32; below 0.1 noise makes more finds than can be counted."""
 
 DEPTHS = 25
-"""Images of the calibration, at most, on which ghosts are counted."""
+"""Largest number of the calibration's images on which side-lobes are counted. Chosen between 10 and 51 on the same,
+with the same thresholds; the time grows with the number."""
 
 EVEN = 0.2
-"""Largest spread of amplitude, its fraction, with which the joint fit is chosen: it takes particles to be alike."""
+"""Largest spread of the amplitudes, as a fraction of their median, with which the joint fit is chosen. Derived: it
+takes amplitudes to be equal, and a fifth is what its prior allows for."""
 
 EXPLAINED = 1.5
-"""Largest median chi2 of particles with which the joint fit is chosen."""
+"""Largest median chi2 of particles with which the joint fit is chosen. Derived: it is 1 where the model holds."""
 
-LIKE = 0.5
-"""Smallest median C_m with which it is chosen: a crowd of unlike images, too, can explain anything."""
+LEAST_CM = 0.5
+"""Least median C_m with which the joint fit is chosen. As the threshold of `locate`: a crowd of wrong images, too, can
+explain anything."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +57,8 @@ class Settings:
     found, false : DataFrame
         What correlation finds in the frames looked at, and in the same with their sign turned, from a C_m of `LOWEST`
         on: the columns of `locate`, and `frame`.
-    ghosts : DataFrame
-        What it finds beside a lone particle at its own place, likewise; `frame` is the image of the calibration.
+    side_lobes : DataFrame
+        What it finds beside a lone particle, likewise; `frame` is the image of the calibration.
     """
 
     arguments: dict[str, object]
@@ -62,7 +66,7 @@ class Settings:
     threshold: float
     found: pd.DataFrame
     false: pd.DataFrame
-    ghosts: pd.DataFrame
+    side_lobes: pd.DataFrame
 
     @property
     def inverted(self) -> bool:
@@ -86,15 +90,16 @@ def choose_settings(
     Parameters
     ----------
     frames : iterable of arrays (rows, columns)
-        Of the film to be measured; only some are looked at, from the first on.
+        Of the film to be measured; only some are looked at: of a sequence, evenly spread over all of it, and of
+        anything else the first.
     calibration : Calibration
     threshold : float, optional
         Lowest C_m of a particle, used as it is. If not given, the lowest at which no more than `false_fraction` of the
-        finds are false, to judge by the frames with their sign turned and by the ghosts of lone particles.
+        finds are false, to judge by the frames with their sign turned and by the side-lobes of lone particles.
     method : str, optional
-        "correlation" or "joint". If not given, joint where its model holds: where it finds particles alike in
-        amplitude (spread at most `EVEN`) and like the calibration's (median C_m at least `LIKE`) and explains what is
-        around them (median chi2 at most `EXPLAINED`).
+        "correlation" or "joint". If not given, joint where its model holds: where it finds particles of even
+        amplitude (spread at most `EVEN`) that look like the calibration's (median C_m at least `LEAST_CM`) and
+        explains what is around them (median chi2 at most `EXPLAINED`).
     refine : bool, optional
         Of "correlation"; True if not given.
     min_distance_px : float, optional
@@ -116,38 +121,19 @@ def choose_settings(
     """
     if positive("false_fraction", false_fraction) >= 1:
         raise ValueError(f"false_fraction: got {false_fraction}, allowed is above 0 and below 1")
-    if threshold is not None and positive("threshold", threshold) > 1:
-        raise ValueError(f"threshold: got {threshold}, allowed is above 0 and at most 1")
-    if method is not None:
-        choice("method", method, METHODS)
     given = {"threshold": threshold, "refine": refine, "min_distance_px": min_distance_px}
     given = {name: value for name, value in given.items() if value is not None}
-    if method == "joint" and given:
-        raise ValueError(f"{', '.join(given)}: got one with method 'joint', which has none of them")
+    _must_go_together(method, given)
     whole("looked_at", looked_at, 1, 10_000)
-    try:
-        looked = [real_array("image", frame, 2) for frame in islice(frames, looked_at)]
-    except TypeError as error:
-        if str(error).startswith("image"):
-            raise
-        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+    looked = [image_array("image", frame, 2) for frame in _spread(frames, looked_at)]
     if not looked:
         raise ValueError("frames: got none, needed is one or more")
     others = {name: value for name, value in given.items() if name != "threshold"}
-    found, false = (
-        pd.concat(
-            [
-                locate(sign * frame, calibration, threshold=LOWEST, **others).assign(frame=i)
-                for i, frame in enumerate(looked)
-            ],
-            ignore_index=True,
-        )
-        for sign in (1, -1)
-    )
-    ghosts, alone = _ghosts(calibration, noise_level(looked[0]), others)
+    found, false = (_found([sign * frame for frame in looked], calibration, others) for sign in (1, -1))
+    side_lobes, alone = _side_lobes(calibration, noise_level(looked[0]), others)
     reasons = {"refine": "the whole stack is walked", "min_distance_px": "a quarter of a template"}
     if threshold is None:
-        finds = (table["cm"] for table in (found, false, ghosts, alone))
+        finds = (table["cm"] for table in (found, false, side_lobes, alone))
         threshold, reasons["threshold"] = _threshold(*finds, false_fraction)
     if method is not None:
         given["method"] = method
@@ -163,15 +149,45 @@ def choose_settings(
         for name, value in arguments.items()
     ]
     table = pd.DataFrame(rows, columns=["setting", "value", "how", "why"]).set_index("setting")
-    return Settings(arguments, table, threshold, found, false, ghosts)
+    return Settings(arguments, table, threshold, found, false, side_lobes)
+
+
+def _spread(frames: Iterable[ArrayLike], n: int) -> list[ArrayLike]:
+    """Up to `n` frames (rows, columns), evenly spread over a sequence, the first of anything else."""
+    if hasattr(frames, "__len__") and hasattr(frames, "__getitem__") and not isinstance(frames, dict):
+        middles = (np.arange(n) + 0.5) * len(frames) / n
+        return [frames[k] for k in np.unique(middles.astype(int)).tolist()] if len(frames) else []
+    try:
+        return list(islice(frames, n))
+    except TypeError as error:
+        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+
+
+def _must_go_together(method: str | None, given: dict[str, object]) -> None:
+    """Raise TypeError or ValueError unless the given settings belong to the given method."""
+    if method is not None:
+        choice("method", method, METHODS)
+    if positive("threshold", given.get("threshold", 1.0)) > 1:
+        raise ValueError(f"threshold: got {given['threshold']}, allowed is above 0 and at most 1")
+    if method == "joint" and given:
+        raise ValueError(f"{', '.join(given)}: got one with method 'joint', which has none of them")
+
+
+def _found(frames: list[NDArray], calibration: Calibration, settings: dict[str, object]) -> pd.DataFrame:
+    """What correlation finds in frames (rows, columns) from a C_m of `LOWEST` on."""
+    tables = [locate(frame, calibration, threshold=LOWEST, **settings) for frame in frames]
+    return pd.concat([table.assign(frame=i) for i, table in enumerate(tables)], ignore_index=True)
 
 
 def _above(cm: pd.Series, threshold: float) -> int:
+    """Number of C_m (n,) that reach a threshold."""
     return int((cm >= threshold).sum())
 
 
-def _ghosts(calibration: Calibration, noise: float, settings: dict[str, object]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """What is found beside, and at, the place of lone particles."""
+def _side_lobes(
+    calibration: Calibration, noise: float, settings: dict[str, object]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """What is found beside, and at, the position of lone particles."""
     size, rng = calibration.size, np.random.default_rng(0)
     middle, beside, at = size - 1, [], []
     for k in np.unique(np.rint(np.linspace(0, len(calibration) - 1, DEPTHS)).astype(int)):
@@ -186,14 +202,14 @@ def _ghosts(calibration: Calibration, noise: float, settings: dict[str, object])
 
 
 def _threshold(
-    found: pd.Series, false: pd.Series, ghosts: pd.Series, alone: pd.Series, fraction: float
+    found: pd.Series, false: pd.Series, side_lobes: pd.Series, alone: pd.Series, fraction: float
 ) -> tuple[float, str]:
     """Lowest threshold with so small a fraction of false finds, and the reason in words."""
     for threshold in np.arange(LOWEST, 0.99, 0.01).round(2).tolist():
-        n, n_false, n_ghosts, n_alone = (_above(cm, threshold) for cm in (found, false, ghosts, alone))
-        if n and n_false / n + n_ghosts / max(n_ghosts + n_alone, 1) <= fraction:
+        n, n_false, n_side, n_alone = (_above(cm, threshold) for cm in (found, false, side_lobes, alone))
+        if n and n_false / n + n_side / max(n_side + n_alone, 1) <= fraction:
             turned = f"{n} found from there on, {n_false} with the frames' sign turned"
-            return threshold, f"{turned}; {n_ghosts} beside {n_alone} lone particles"
+            return threshold, f"{turned}; {n_side} beside {n_alone} lone particles"
     return 0.5, "nothing is found that is not found with the frames' sign turned, too"
 
 
@@ -201,13 +217,13 @@ def _method(frame: NDArray, calibration: Calibration) -> tuple[str, str]:
     """What method a frame is for, and the reason in words."""
     table = locate(frame, calibration, method="joint")
     if len(table) < 5:
-        return "correlation", "too few particles to see if they are alike, as joint takes them to be"
+        return "correlation", "too few particles to see if they have equal amplitudes, as joint takes them to have"
     amplitude, chi2 = table["amplitude"], float(table["chi2"].median())
-    # Of normal numbers, the standard deviation; of a few far brighter ones it takes notice.
+    # Of normal numbers, the standard deviation; a few far brighter particles change it, as they should.
     spread = float((amplitude.quantile(0.9) - amplitude.quantile(0.1)) / (2.563 * amplitude.median()))
     cm = float(table["cm"].median())
-    method = "joint" if spread <= EVEN and chi2 <= EXPLAINED and cm >= LIKE else "correlation"
+    method = "joint" if spread <= EVEN and chi2 <= EXPLAINED and cm >= LEAST_CM else "correlation"
     return method, (
-        f"joint finds {len(table)} particles, as bright as each other to {100 * spread:.0f} %, with a median C_m of "
+        f"joint finds {len(table)} particles, of equal amplitude to {100 * spread:.0f} %, with a median C_m of "
         f"{cm:.2f}, and leaves a chi2 of {chi2:.1f}"
     )

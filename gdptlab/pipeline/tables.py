@@ -16,7 +16,7 @@ from gdptlab.calibration import Calibration, checked
 from gdptlab.locate import THRESHOLD, locate
 
 POINTS = ("napari", "imagej")
-"""Programs that `save_points` writes for."""
+"""Programs that `save_points` can write for."""
 
 
 def in_um(table: pd.DataFrame, um_per_px: float) -> pd.DataFrame:
@@ -33,7 +33,8 @@ def in_um(table: pd.DataFrame, um_per_px: float) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        With `x_um`, `y_um` and so on, after the other columns; `z_um` is as it was.
+        With `x_um`, `y_um` and so on, after the other columns: those in px times `um_per_px`, so that positions count
+        from the centre of the first pixel, too. `z_um` is as it was.
 
     Raises
     ------
@@ -55,7 +56,7 @@ def fingerprint(calibration: Calibration) -> str:
 
 
 def about(calibration: Calibration, settings: dict[str, object]) -> dict[str, object]:
-    """What a table was made with: hash of the calibration, settings of `locate` and others, versions."""
+    """What a table was made with: hashes of calibration and sources, settings of `locate` and others, versions."""
     checked(calibration)
     unsaid = {name: p.default for name, p in signature(locate).parameters.items() if p.kind is p.KEYWORD_ONLY}
     settings = unsaid | settings
@@ -151,8 +152,8 @@ def save_points(
     scale = 1.0 if um_per_px is None else check.positive("um_per_px", um_per_px)
     frame = table["frame"] if "frame" in table else pd.Series(0, table.index)
     if program == "napari":
-        place = [scale * table["y_px"], scale * table["x_px"]]
-        axes = [frame, *([] if um_per_px is None else [table["z_um"]]), *place]
+        position = [scale * table["y_px"], scale * table["x_px"]]
+        axes = [frame, *([] if um_per_px is None else [table["z_um"]]), *position]
         points = {f"axis-{i}": axis for i, axis in enumerate(axes)}
         points |= {name: table[name].astype(float) for name in table if table[name].dtype.kind in "buif"}
         name_of_row, first = "index", 0
@@ -166,6 +167,7 @@ def save_points(
 
 
 def _path(path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> Path:
+    """Path of a file, if its name ends in one of these suffixes."""
     if not isinstance(path, str | os.PathLike):
         raise TypeError(f"path: got a {type(path).__name__}, allowed is the path of a file")
     if Path(path).suffix not in suffixes:

@@ -31,7 +31,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "limits": ["biases", "errors_against_bound", "expected_errors"],
         "live": ["latencies", "live_panel", "loop_and_timer", "one_loop", "watch_live"],
         "notebook": ["end_notebook"],
-        "overlap": ["REACH", "error_ratios", "film_followed", "found_and_left", "laid_bare"],
+        "overlap": ["RESIDUAL_END", "error_ratios", "film_followed", "found_and_left", "laid_bare"],
         "quality": ["calibration_page", "depth_against_truth", "measured_page", "symptoms"],
         "speed": ["breakdown", "frame_times", "real_time", "scaling"],
         "style": ["COLOURS", "FIGURES", "bare", "depth_label", "extent", "folder", "save", "use"],

@@ -120,7 +120,7 @@ def maps_around(
     scale = 2 if calibration.half_resolution else 1
     margin, half = calibration.search_templates.shape[-1] // 2, calibration.size // 2
     column, row = (round(particle[name] / scale) - margin for name in ("x_px", "y_px"))
-    reach = half // scale
+    around = half // scale
     count = -(-len(maps) // 3)
     left, right = figure.subfigures(1, 2, width_ratios=[1.1, 1])
     axes = left.subplots()
@@ -133,8 +133,8 @@ def maps_around(
     for panel in grid:
         panel.set_visible(False)
     for panel, map_, z in zip(grid, maps, calibration.z_um[calibration.subset], strict=False):
-        r, c = max(row - reach, 0), max(column - reach, 0)
-        part = map_[r : row + reach + 1, c : column + reach + 1]
+        r, c = max(row - around, 0), max(column - around, 0)
+        part = map_[r : row + around + 1, c : column + around + 1]
         panel.set_visible(True)
         shown = panel.imshow(part, cmap=WARMTH, vmin=0, vmax=1)
         peak = map_[row - 1 : row + 2, column - 1 : column + 2].max()

@@ -73,12 +73,12 @@ def score_curves(
     figure, [axes] = panels(len(columns), max(3.4 * len(columns), 6), 3.1)
     for panel, column in zip(axes, columns, strict=True):
         for colour, marker, (name, table) in zip(COLOURS, MARKERS, tables.items(), strict=False):
-            spread = table.get(f"{column}_std")
+            bars = table.get(f"{column}_std")
             if f"{column}_low" in table:
                 ends = table[column] - table[f"{column}_low"], table[f"{column}_high"] - table[column]
-                spread = np.maximum(ends, 0)
+                bars = np.maximum(ends, 0)
             panel.errorbar(
-                table.index, table[column], yerr=spread, color=colour, marker=marker, mfc="none", label=name, capsize=2
+                table.index, table[column], yerr=bars, color=colour, marker=marker, mfc="none", label=name, capsize=2
             )
         ends = (t.get(f"{column}_high", t[column] + t.get(f"{column}_std", 0)) for t in tables.values())
         top = np.nanmax([0.1, *(end.max() for end in ends)])  # a score is NaN where nothing was found

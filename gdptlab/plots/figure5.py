@@ -129,12 +129,13 @@ def fig5_settings(points: pd.DataFrame, labels: Mapping[tuple, str], counts: Map
         if "valid" in table:
             last.plot(table.index, table["valid"], color=colour, ls=LINES[i % 4], label=name)
     last.set(xlabel="t (s)", ylabel="particles", ylim=(0, None), title="Valid (line) and all detected (dots)")
-    last.legend(fontsize="small", loc="lower left")
+    lines, words = last.get_legend_handles_labels()
     handles = [
         Line2D([], [], color=COLOURS[0], marker="o", label="refined"),
         Line2D([], [], color=COLOURS[1], marker="s", mfc="white", label="not refined"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize="small")
+    names = [*(handle.get_label() for handle in handles), *words]
+    figure.legend([*handles, *lines], names, loc="outside lower right", ncols=len(names), fontsize="small")
     return figure
 
 

@@ -99,8 +99,8 @@ def biases(tables: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
         panel.axhline(0, color="black", lw=0.8)
         for i, (label, table) in enumerate(methods.items()):
             panel.errorbar(table.index, table["mean"], table["sem"], **_points(i, label))
-        reach = max(2 * third, *(1.2 * (table["mean"].abs() + table["sem"]).max() for table in methods.values()))
-        panel.set(xlabel=xlabel, ylabel=f"mean {ylabel}", ylim=(-reach, reach))
+        end = max(2 * third, *(1.2 * (table["mean"].abs() + table["sem"]).max() for table in methods.values()))
+        panel.set(xlabel=xlabel, ylabel=f"mean {ylabel}", ylim=(-end, end))
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     return figure

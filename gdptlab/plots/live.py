@@ -19,8 +19,11 @@ from gdptlab.live.monitor import Monitor, Result, Status
 from gdptlab.plots.experiment import LINES, TRIGGER_COLOURS, limit_to_channel
 from gdptlab.plots.style import COLOURS, DEPTH, MARKERS, bare, grey, panels, styled
 
-_PATIENCE_S = 5e-4  # after which drawing lets the monitor's threads go on; Python's own is ten times as long
-_FONT = {"family": "monospace", "size": 9}
+SWITCH_S = 5e-4
+"""Time, s, after which drawing gives way to the monitor's threads; Python's own switch interval is ten times that."""
+
+FONT = {"family": "monospace", "size": 9}
+"""Font of the panel's numbers."""
 
 
 @styled
@@ -83,16 +86,18 @@ def live_panel(
     _fractions(axes["fractions"], recent, level, seconds)
     _latencies(axes["late"], recent, seconds)
     axes["words"].axis("off")
-    axes["words"].text(0, 1, _words(status), va="top", transform=axes["words"].transAxes, **_FONT)
+    axes["words"].text(0, 1, _words(status), va="top", transform=axes["words"].transAxes, **FONT)
     return figure
 
 
 def _span(recent: pd.DataFrame, seconds: float) -> tuple[float, float]:
+    """Give the limits of the time axis: the last `seconds` before the newest decision."""
     end = recent["decision_s"].max() if len(recent) else 0.0
     return max(end - seconds, 0), max(end, 1.0)
 
 
 def _fractions(axes: Axes, recent: pd.DataFrame, level: float, seconds: float) -> None:
+    """Draw the two fractions against time, thick while their trigger is on."""
     axes.axhline(level, color="black", lw=0.8, ls=":")
     for name, colour in TRIGGER_COLOURS.items():
         if f"fraction_{name}" in recent:
@@ -104,6 +109,7 @@ def _fractions(axes: Axes, recent: pd.DataFrame, level: float, seconds: float) -
 
 
 def _latencies(axes: Axes, recent: pd.DataFrame, seconds: float) -> None:
+    """Draw the latency of each evaluated frame against time."""
     if len(recent):
         axes.plot(recent["t_s"], recent["latency_ms"], ".", color=COLOURS[2], ms=4)
         axes.set_ylim(0, 1.15 * recent["latency_ms"].max())
@@ -111,6 +117,7 @@ def _latencies(axes: Axes, recent: pd.DataFrame, seconds: float) -> None:
 
 
 def _words(status: Status) -> str:
+    """Write the monitor's state and its counts, a line for each."""
     lines = [
         f"{status.state}, {status.grabbed} frames",
         f"camera  {status.camera_hz:5.1f} /s",
@@ -141,7 +148,7 @@ def watch_live(monitor: Monitor, *, period_s: float = 1.0, **settings: Any) -> N
     from IPython.display import display
 
     shown, ended, patience_s = None, False, sys.getswitchinterval()
-    sys.setswitchinterval(_PATIENCE_S)
+    sys.setswitchinterval(SWITCH_S)
     try:
         while not ended:
             ended = monitor.wait(period_s)

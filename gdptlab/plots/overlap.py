@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from gdptlab.plots.experiment import TRIGGERS
 from gdptlab.plots.style import COLOURS, GREY, bare, grey, panels, scale_bar, styled
 
-REACH = 6.0
-"""Noise of a pixel at which the colours of what is left over end."""
+RESIDUAL_END = 6.0
+"""Residual at which its scale of colours ends, in units of the noise of a pixel: beyond it noise hardly ever is."""
 
-LEFT_OVER = plt.get_cmap("PuOr", 13)
-"""Scale of few colours, with white in the middle."""
+RESIDUAL = plt.get_cmap("PuOr", 13)
+"""Scale of few colours for a residual, with white in the middle."""
 
 MARKS = {
     "found": {"marker": "o", "color": COLOURS[5], "s": 70, "lw": 1.4},
     "missed": {"marker": "s", "color": COLOURS[1], "s": 80, "lw": 1.8},
     "false": {"marker": "x", "color": COLOURS[4], "s": 50, "lw": 2.2},
 }
-"""Of true particles that are found and missed, and of what is measured where there is none: three shapes."""
+"""Marks of true particles that are found, of those that are missed, and of measured ones that are false."""
 
 
 @styled
@@ -37,7 +37,7 @@ def found_and_left(
     pairs: Mapping[str, pd.DataFrame],
     left: Mapping[str, NDArray],
 ) -> Figure:
-    """Show what methods find in a frame, and below what it leaves of the frame.
+    """Show what methods find in a frame, and below the residual.
 
     Parameters
     ----------
@@ -72,8 +72,8 @@ def found_and_left(
             upper.scatter(here["x_px"], here["y_px"], **look)
         counts = ", ".join(f"{len(here)} {kind}" for kind, here in groups.items())
         upper.set_title(f"{name}: {counts}")
-        shown = lower.imshow(left[name], vmin=-REACH, vmax=REACH, cmap=LEFT_OVER)
-        lower.set_title("what it leaves of the frame")
+        shown = lower.imshow(left[name], vmin=-RESIDUAL_END, vmax=RESIDUAL_END, cmap=RESIDUAL)
+        lower.set_title("residual")
         lower.set(xlabel="x (px)")
         lower.spines[:].set_visible(True)
     for panel in axes[:, 0]:
@@ -84,7 +84,7 @@ def found_and_left(
         for kind, m in MARKS.items()
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=3)
-    figure.colorbar(shown, ax=axes[1], label="left over (noise of a pixel)", extend="both", shrink=0.9)
+    figure.colorbar(shown, ax=axes[1], label="residual (noise of a pixel)", extend="both", shrink=0.9)
     return figure
 
 
@@ -121,14 +121,14 @@ def laid_bare(rows: Mapping[str, Sequence[NDArray]], titles: Sequence[str], um_p
 
 
 @styled
-def error_ratios(ratios: Mapping[str, pd.DataFrame], reach: float = 6.0) -> Figure:
-    """Plot how errors, each over its own standard deviation, are spread, beside the normal distribution.
+def error_ratios(ratios: Mapping[str, pd.DataFrame], limit: float = 6.0) -> Figure:
+    """Plot how errors, each over its own standard deviation, are distributed, beside the normal distribution.
 
     Parameters
     ----------
     ratios : dict of DataFrame
         By name: a column for each axis, its name that of the panel.
-    reach : float
+    limit : float
         Ends of the scale; what is beyond is counted in the outermost bins.
 
     Returns
@@ -138,13 +138,13 @@ def error_ratios(ratios: Mapping[str, pd.DataFrame], reach: float = 6.0) -> Figu
     """
     columns = list(next(iter(ratios.values())))
     figure, [axes] = panels(len(columns), 10, 3.9, sharey=True)
-    edges = np.linspace(-reach, reach, 25)
-    s = np.linspace(-reach, reach, 201)
+    edges = np.linspace(-limit, limit, 25)
+    s = np.linspace(-limit, limit, 201)
     for panel, column in zip(axes, columns, strict=True):
         panel.plot(s, np.exp(-(s**2) / 2) / np.sqrt(2 * np.pi), color="black", lw=1.2, ls="--", label="normal")
         lines = []
         for i, (name, table) in enumerate(ratios.items()):
-            values = np.clip(table[column], -reach, reach)
+            values = np.clip(table[column], -limit, limit)
             density = np.histogram(values, edges)[0] / len(values) / (edges[1] - edges[0])
             panel.stairs(density, edges, color=COLOURS[i], lw=1.8, label=f"{name}, n = {len(values)}")
             plain, robust = np.sqrt(np.mean(table[column] ** 2)), np.median(np.abs(table[column])) / 0.6745

@@ -23,7 +23,7 @@ from gdptlab.plots.frames import circled
 from gdptlab.plots.style import COLOURS, MARK, bare, depth_label, grey, panels, styled
 
 NUMBERED = 60
-"""Beads of a scan, the brightest, whose numbers are shown."""
+"""Number of beads of a scan whose numbers are shown, the brightest: more would cover each other."""
 
 
 @styled
@@ -80,8 +80,8 @@ def calibration_page(calibration: Calibration, shown: int = 8) -> Figure:
         drift.plot(z_um, values, line, color=colour, label=name)
     drift.set(xlabel="z (µm)", ylabel="drift of the beads (px)", title="Drift")
     drift.legend(fontsize="small")
-    differ.plot(z_um, 1 - depths["next_alike"], color=COLOURS[0], label="from the next slice")
-    differ.plot(z_um, 1 - depths["twin"], ".", color=MARK, label="from the twin, if any")
+    differ.plot(z_um, 1 - depths["next_correlation"], color=COLOURS[0], label="from the next slice")
+    differ.plot(z_um, 1 - depths["ambiguous_correlation"], ".", color=MARK, label="from the ambiguous depth, if any")
     differ.axhline(0.05, color="0.6", lw=1, ls=":", label="mistaken for it")
     differ.set(xlabel="z (µm)", ylabel="1 − correlation", yscale="log", title="Different")
     differ.legend(fontsize="small")
@@ -178,9 +178,10 @@ def measured_page(frame: NDArray, table: pd.DataFrame, settings: Settings, calib
 
 
 def _cm_histogram(axes: Axes, settings: Settings) -> None:
+    """Draw how C_m is distributed, of particles and of finds that are false for certain."""
     bins = np.arange(0.2, 1.0001, 0.025)
     axes.hist(settings.found["cm"], bins, color=COLOURS[0], alpha=0.8, label="frames as they are")
-    none = {"with their sign turned": settings.false, "beside lone particles": settings.ghosts}
+    none = {"with their sign turned": settings.false, "beside lone particles": settings.side_lobes}
     for (name, finds), colour, line in zip(none.items(), COLOURS[1:], ("-", "--"), strict=False):
         axes.hist(finds["cm"], bins, histtype="step", color=colour, lw=1.8, ls=line, label=f"{name}: all false")
     axes.axvline(settings.threshold, color="black", lw=1.2, ls=":", label=f"threshold {settings.threshold:.2f}")
@@ -190,6 +191,7 @@ def _cm_histogram(axes: Axes, settings: Settings) -> None:
 
 
 def _even(axes: Axes, table: pd.DataFrame) -> None:
+    """Draw chi2 against the amplitude of each particle."""
     axes.plot(table["amplitude"], table["chi2"], "o", color=COLOURS[0], ms=4, mew=0, alpha=0.8)
     axes.axhline(1, color="0.6", lw=1, ls=":")
     axes.axvline(table["amplitude"].median(), color="0.6", lw=1, ls=":")

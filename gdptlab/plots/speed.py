@@ -12,7 +12,8 @@ from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
 from gdptlab.plots.style import COLOURS, MARKERS, panels, styled
 
-_GREY = "0.45"  # of what is not measured, or is only a floor
+GREY = "0.45"
+"""Grey of lines that are not measured, or that only tell what is least possible."""
 
 
 @styled
@@ -44,7 +45,7 @@ def frame_times(times: pd.DataFrame, floors: Mapping[str, pd.Series] | None = No
         panel.xaxis.set_minor_locator(NullLocator())
         panel.grid(axis="y", color="0.9", lw=0.8)
     for name, dashes in zip(floors or {}, [(1, 1.5), (5, 2)], strict=False):
-        axes[-1].plot(floors[name].index, floors[name], color=_GREY, lw=1.4, ls=(0, dashes), label=name)
+        axes[-1].plot(floors[name].index, floors[name], color=GREY, lw=1.4, ls=(0, dashes), label=name)
     axes[0].set_ylabel("one frame (ms)")
     axes[0].yaxis.set_major_formatter(FuncFormatter(lambda ms, _: f"{ms:g}"))
     axes[0].yaxis.set_minor_formatter(NullFormatter())
@@ -93,7 +94,7 @@ def scaling(rates: pd.Series) -> Figure:
     figure, axes = panels(1, 4.2, 3.2)
     panel, (first, *_) = axes[0, 0], rates.index
     ideal = rates[first] / first * np.array([0, rates.index.max()])
-    panel.plot([0, rates.index.max()], ideal, color=_GREY, ls="--", label="in proportion")
+    panel.plot([0, rates.index.max()], ideal, color=GREY, ls="--", label="in proportion")
     panel.plot(rates.index, rates, color=COLOURS[0], marker=MARKERS[0], ls="none", ms=7, label="measured")
     panel.set(xlabel="processes", ylabel="frames per second", xticks=rates.index, xlim=(0, None), ylim=(0, None))
     panel.legend(loc="upper left")

@@ -17,7 +17,8 @@ from gdptlab.experiment.film import Film
 from gdptlab.plots.experiment import limit_to_channel
 from gdptlab.plots.style import COLOURS, DEPTH, MARK, grey, panels, scale_bar, styled
 
-_BINS = 15  # of a velocity profile
+BINS = 15
+"""Number of bins of a velocity profile."""
 
 
 @styled
@@ -102,10 +103,10 @@ def _binned(axes: Axes, place: NDArray, value: NDArray, edges: NDArray, colour: 
     """Median and quartiles of a velocity in bins of position."""
     groups = pd.Series(value).groupby(pd.cut(pd.Series(place), edges), observed=False)
     low, middle, high = (groups.quantile(q).to_numpy() for q in (0.25, 0.5, 0.75))
-    reach = np.stack([middle - low, high - middle])
+    bars = np.stack([middle - low, high - middle])
     at = (edges[1:] + edges[:-1]) / 2
     axes.errorbar(
-        at, middle, yerr=reach, color=colour, marker=marker, ls="", lw=1, capsize=2, ms=5, label=label, zorder=3
+        at, middle, yerr=bars, color=colour, marker=marker, ls="", lw=1, capsize=2, ms=5, label=label, zorder=3
     )
 
 
@@ -137,7 +138,7 @@ def velocity_profiles(table: pd.DataFrame, focusing: Focusing) -> Figure:
         speed = channel.velocity(y, inside[:, None])
         axes[0, 0].fill_between(y, speed.min(axis=0), speed.max(axis=0), color=COLOURS[k], alpha=0.25, lw=0)
         _binned(
-            axes[0, 0], part["y_um"], part["vx_um_s"], np.linspace(-w / 2, w / 2, _BINS + 1), COLOURS[k], "os"[k], label
+            axes[0, 0], part["y_um"], part["vx_um_s"], np.linspace(-w / 2, w / 2, BINS + 1), COLOURS[k], "os"[k], label
         )
     axes[0, 0].set(xlabel="y (µm)", ylabel="$v_x$ (µm/s)", title="flow: bands, Poiseuille", ylim=(0, None))
     axes[0, 0].legend(fontsize="small", loc="lower center")
@@ -150,7 +151,7 @@ def velocity_profiles(table: pd.DataFrame, focusing: Focusing) -> Figure:
             color="black",
             label="eq. (1a)" if axis == "y" else "eq. (1b)",
         )
-        edges = np.linspace(place[0], place[-1], _BINS + 1)
+        edges = np.linspace(place[0], place[-1], BINS + 1)
         _binned(panel, table[f"{axis}_um"], seen, edges, COLOURS[1], "o", "measured")
         top = 1.6 * focusing.amplitude_um_s(axis)
         panel.set(xlabel=f"{axis} (µm)", ylabel=f"$v_{axis}$ (µm/s)", title=f"sound along {axis}", ylim=(-top, top))

@@ -6,7 +6,7 @@ which is its own, and the rate 2πU/w, which is everybody's. Both are fitted to 
 Errors are larger than the standard deviations of positions say, and there is a remedy for each reason. A crowd closes
 in: in each second of the film all are enlarged by one factor, so that the middle half of the residuals is as it should
 be. A few measurements are far off: residuals are taken to have the distribution of Student's t with `FREEDOM` degrees
-of freedom, in which those weigh little. Errors of one track are alike (a neighbour stays a neighbour), and so are those
+of freedom, in which those weigh little. Errors of one track correlate (a neighbour stays a neighbour), and so are those
 of all particles at one depth (they share the calibration): the interval comes from how much the result owes to each
 track, and to each slice of depth, not from the number of rows.
 """
@@ -27,13 +27,25 @@ from gdptlab.experiment.film import Film
 from gdptlab.tracking.tracks import POSITION, identify
 
 FREEDOM = 4.0
-"""Of Student's t: at 5 standard deviations a residual weighs a sixth of what it would otherwise."""
+"""Degrees of freedom of Student's t. Convention of robust fits: at 5 standard deviations a residual weighs a sixth of
+what it would otherwise; with many more, outliers count in full, and with 1, those of normal errors lose half their
+weight."""
 
 SLICE_UM = 4.0
-"""Depth over which the error of a calibration is one and the same: two of the paper's 2 µm between images."""
+"""Depth, µm, over which the error of a calibration is one and the same. Derived: two of the paper's 2 µm between
+images, over which interpolation along z correlates; with less, the interval is too narrow, with more, too wide."""
 
-_ROUNDS = 200
-_LONGEST_STEP = 0.3  # of the logarithm of the rate
+ROUNDS = 200
+"""Largest number of steps of the fit. Derived: with steps of `LONGEST_STEP` the rate changes by a factor of e**60; a
+fit that needs more does not converge."""
+
+LONGEST_STEP = 0.3
+"""Longest step of the fit, of the logarithm of the rate. Derived: a third more or less, over which paths bend
+little."""
+
+OFF_WALL, OFF_AXIS = 1e-4, 1e-6
+"""Least distances of a position from the walls, where nothing moves, and from the axis, where a derivative is 0 / 0, as
+fractions of the channel's extent. Derived: far below any error of measurement, far above rounding."""
 
 
 @dataclass(frozen=True)
@@ -110,12 +122,18 @@ def fit_energy(
 
 
 def _mixed(rates: tuple[_Rate, _Rate], weight: NDArray) -> _Rate:
-    """Weighted sum of two fits, of their logarithms, errors that they share included."""
+    """Weighted sum (weights (2,)) of the logarithms of two fits, with the errors that both have from the same cause."""
     logs, of_tracks, of_slices = zip(*((r.log_ratio, r.tracks, r.slices) for r in rates), strict=True)
     return _Rate(float(weight @ logs), weight @ of_tracks, weight @ of_slices)
 
 
+def _scale(residuals: pd.Series) -> float:
+    """Standard deviation about 0 of residuals (n,), of which a few may be far off."""
+    return stats.median_abs_deviation(residuals, center=lambda values, axis: 0.0, scale="normal")
+
+
 def _variance(of_tracks: NDArray, of_slices: NDArray) -> float:
+    """Variance of a logarithm of a rate from what tracks (G,) and slices (S,) contributed."""
     return float((of_tracks**2).sum() + (of_slices**2).sum())
 
 
@@ -124,14 +142,14 @@ def _interval(scale: float, rate: _Rate, confidence: float) -> dict[str, float]:
     variance = _variance(rate.tracks, rate.slices)
     freedom = max(variance**2 / ((rate.tracks**4).sum() + (rate.slices**4).sum()), 1)
     std = np.sqrt(variance)
-    value, reach = scale * np.exp(rate.log_ratio), stats.t.ppf((1 + confidence) / 2, freedom) * std
-    return {"value": value, "std": value * std, "low": value * np.exp(-reach), "high": value * np.exp(reach)}
+    value, half = scale * np.exp(rate.log_ratio), stats.t.ppf((1 + confidence) / 2, freedom) * std
+    return {"value": value, "std": value * std, "low": value * np.exp(-half), "high": value * np.exp(half)}
 
 
 def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: float) -> _Rate:
     """Gauss-Newton for the rate, and for each track where it was at the middle of its time."""
     extent, start_per_s = focusing.extent_um(axis), 1 / focusing.focusing_time_s(axis)
-    place, std = (tracks[f"{axis}{name}_um"].to_numpy(dtype=float) for name in ("", "_std"))
+    position, std = (tracks[f"{axis}{name}_um"].to_numpy(dtype=float) for name in ("", "_std"))
     track, number = np.unique(tracks["particle"], return_inverse=True)[1], tracks["particle"].nunique()
 
     def total(values: NDArray) -> NDArray:
@@ -142,26 +160,25 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
     t = tracks["frame"].to_numpy() / frame_rate_hz
     second = np.floor(t)
     t = t - (total(t) / rows)[track]
-    middle, log_ratio = total(place) / rows, 0.0
-    for _ in range(_ROUNDS):
-        # Off the walls, where nothing moves, and the axis, where by_middle would be 0 / 0.
-        middle = np.where(middle < 0, -1, 1) * np.clip(np.abs(middle), 1e-6 * extent, (0.5 - 1e-4) * extent)
+    middle, log_ratio = total(position) / rows, 0.0
+    for _ in range(ROUNDS):
+        middle = np.where(middle < 0, -1, 1) * np.clip(np.abs(middle), OFF_AXIS * extent, (0.5 - OFF_WALL) * extent)
         rate = start_per_s * np.exp(log_ratio)
         path = extent / np.pi * np.arctan(np.tan(np.pi * middle / extent)[track] * np.exp(-rate * t))
         swing = np.sin(2 * np.pi * path / extent)
         by_middle = swing / np.sin(2 * np.pi * middle / extent)[track]
         by_log = -rate * t * extent / (2 * np.pi) * swing
-        off = pd.Series(np.abs(place - path) / std)
-        noise = std * np.maximum(1.4826 * off.groupby(second).transform("median").to_numpy(), 1e-9)
-        square = ((place - path) / noise) ** 2
+        off = pd.Series(np.abs(position - path) / std)
+        noise = std * np.maximum(off.groupby(second).transform(_scale).to_numpy(), 1e-9)
+        square = ((position - path) / noise) ** 2
         weight = (FREEDOM + 1) / (FREEDOM + square) / noise**2
         own = total(weight * by_middle**2)
         alone = by_log - (total(weight * by_middle * by_log) / own)[track] * by_middle  # what no `middle` can do
-        pull = weight * alone * (place - path)
+        pull = weight * alone * (position - path)
         information = (weight * alone**2).sum()
-        step = float(np.clip(pull.sum() / information, -_LONGEST_STEP, _LONGEST_STEP))
+        step = float(np.clip(pull.sum() / information, -LONGEST_STEP, LONGEST_STEP))
         log_ratio += step
-        middle = middle + total(weight * by_middle * (place - path - by_log * step)) / own
+        middle = middle + total(weight * by_middle * (position - path - by_log * step)) / own
         if abs(step) < 1e-7:
             break
     else:
@@ -184,7 +201,7 @@ def imitate(
     Each particle of another film borrows all from one of this film, of the three that began nearest to it in the
     cross-section: errors, standard deviations, frames in which it was missed or out of view, breaks of its track,
     the stretch in which its track ran on along somebody else. So errors stay as far off, as lasting and as typical of a
-    depth and a time as they were. Tracks of nobody stay where they are.
+    depth and a time as they were. Tracks of false finds stay where they are.
 
     Parameters
     ----------
@@ -208,7 +225,7 @@ def imitate(
     owner = who.groupby(tracks["particle"].to_numpy()).agg(lambda part: part.mode().iloc[0])
     lent = tracks.rename(columns={"particle": "track"})[["frame", "track", *POSITION, *stds]]
     lent["lender"] = lent["track"].map(owner)
-    nobodys = lent[lent["lender"] < 0].assign(particle=-1)
+    false_finds = lent[lent["lender"] < 0].assign(particle=-1)
     lent = lent.merge(here.rename(columns={"particle": "lender"}), on=["frame", "lender"], suffixes=("", "_true"))
     for name in POSITION:
         lent[name] -= lent.pop(f"{name}_true")
@@ -222,7 +239,7 @@ def imitate(
         made = there.merge(lent, on=["frame", "lender"], suffixes=("", "_off"))
         for name in POSITION:
             made[name] += made[f"{name}_off"]
-        made = pd.concat([made, nobodys], ignore_index=True)
+        made = pd.concat([made, false_finds], ignore_index=True)
         made["particle"] = made.groupby(["particle", "track"]).ngroup()
         yield made[["frame", "particle", *POSITION, *stds]].sort_values(["frame", "particle"], ignore_index=True)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gdptlab._checks import positive
 from gdptlab._checks import table as check_table
 from gdptlab._files import written_whole
-from gdptlab.tracking.tracks import POSITION, positions_of
+from gdptlab.tracking.tracks import POSITION, frames_of, positions_of
 
 VERTEX = 1
 """VTK's number for a cell that is a single point."""
@@ -39,7 +39,8 @@ def save_paraview_tracks(tracks: pd.DataFrame, path: str | os.PathLike[str], fra
         If there is no such folder.
     """
     path, rate = _path(path, ".pvd"), positive("frame_rate_hz", frame_rate_hz)
-    check_table("tracks", tracks, ["frame", *POSITION])
+    check_table("tracks", tracks, POSITION)
+    frames_of("tracks", tracks)
     positions_of("tracks", tracks)
     root, collection = _vtk_file("Collection")
     path.with_suffix("").mkdir(exist_ok=True)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gdptlab._checks import positive, real_array, whole
 from gdptlab._checks import table as check_table
-from gdptlab.tracking.tracks import positions_of
+from gdptlab.tracking.tracks import must_be_tracks, positions_of
 
 
 def mean_field(
@@ -48,15 +48,19 @@ def mean_field(
     check_table("table", table, ())
     if values is None:
         values = [name for name in (f"v{a}_{unit}_s" for a in "xyz" for unit in ("um", "px")) if name in table]
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise TypeError(f"values: got {values!r}, allowed is a list of columns")
     values = list(values)
     if not values:
         raise ValueError("values: got none, and table has no velocities, needed is a column or more")
+    if set(cells) & set(values):
+        raise ValueError(f"values: got {values}, some of which are axes of the grid, allowed are others")
     check_table("table", table, [*cells, *values])
     edges = {axis: _edges(table[axis], cell, axis) for axis, cell in cells.items()}
     shape = [len(edge) - 1 for edge in edges.values()]
     where = [_cell(table[axis].to_numpy(dtype=float), edge) for axis, edge in edges.items()]
-    inside = np.all([place >= 0 for place in where], axis=0) & np.isfinite(table[values].astype(float)).all(axis=1)
-    cell = np.ravel_multi_index([place[inside] for place in where], shape)
+    inside = np.all([number >= 0 for number in where], axis=0) & np.isfinite(table[values].astype(float)).all(axis=1)
+    cell = np.ravel_multi_index([number[inside] for number in where], shape)
     value = table.loc[inside, values].to_numpy(dtype=float)
     number = table["particle"] if "particle" in table else pd.Series(np.arange(len(table)), table.index)
     n, n_particles, mean, error = _clustered(cell, pd.factorize(number[inside])[0], value, int(np.prod(shape)))
@@ -85,9 +89,9 @@ def _edges(column: pd.Series, cells: int | ArrayLike, axis: str) -> NDArray[np.f
 
 def _cell(values: NDArray, edges: NDArray) -> NDArray[np.int64]:
     """Number of the cell that each value (n,) lies in; -1 outside, and for NaN."""
-    place = np.searchsorted(edges, values, side="right") - 1
-    place[values == edges[-1]] = len(edges) - 2
-    return np.where((values >= edges[0]) & (values <= edges[-1]), place, -1)
+    number = np.searchsorted(edges, values, side="right") - 1
+    number[values == edges[-1]] = len(edges) - 2
+    return np.where((values >= edges[0]) & (values <= edges[-1]), number, -1)
 
 
 def _clustered(
@@ -134,7 +138,7 @@ def mean_squared_displacement(tracks: pd.DataFrame, frame_rate_hz: float, *, lon
     TypeError, ValueError
         If an argument is not of that form, a column is missing, or no track has two rows.
     """
-    check_table("tracks", tracks, ["frame", "particle"])
+    must_be_tracks(tracks)
     columns, rate = positions_of("tracks", tracks), positive("frame_rate_hz", frame_rate_hz)
     if not tracks.duplicated("particle").any():
         raise ValueError("tracks: got none of two or more rows, needed is one")

@@ -17,7 +17,7 @@ import trackpy
 from numpy.typing import ArrayLike, NDArray
 from trackpy.predict import NearestVelocityPredict
 
-from gdptlab._checks import positive, whole
+from gdptlab._checks import LARGEST, positive, whole
 from gdptlab._checks import table as check_table
 from gdptlab.assessment import match
 
@@ -55,16 +55,38 @@ def positions_of(name: str, table: pd.DataFrame) -> list[str]:
     Raises
     ------
     TypeError, ValueError
-        If it is no table, or has neither; if a position is not finite.
+        If it is no table, or has neither; if a position is not finite, or beyond 1e12.
     """
     check_table(name, table, ())
     columns = POSITION if set(POSITION) <= set(table) else POSITION_PX
     if not set(columns) <= set(table):
         raise ValueError(f"{name}: got columns {list(table)}, needed are {', '.join(POSITION)}, or x_px and y_px")
     check_table(name, table, columns)
-    if not np.isfinite(table[columns].to_numpy(dtype=float)).all():
-        raise ValueError(f"{name}: got positions that are NaN or infinite, allowed are finite ones")
+    if not (table[columns].abs() <= LARGEST).all(axis=None):
+        raise ValueError(f"{name}: got positions that are NaN or beyond {LARGEST:g}, allowed are numbers to there")
     return columns
+
+
+def frames_of(name: str, table: pd.DataFrame) -> NDArray[np.int64]:
+    """Frames (n,) of a table.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is no table, has none, or they are not whole numbers.
+    """
+    frames = check_table(name, table, ["frame"])["frame"]
+    if frames.dtype.kind not in "iu":
+        raise TypeError(f"{name}: got frames of type {frames.dtype}, allowed are whole numbers")
+    return frames.to_numpy(dtype=np.int64)
+
+
+def must_be_tracks(tracks: pd.DataFrame) -> None:
+    """Raise TypeError or ValueError unless a table has whole frames, and each particle at most once in a frame."""
+    check_table("tracks", tracks, ["frame", "particle"])
+    frames_of("tracks", tracks)
+    if tracks.duplicated(["frame", "particle"]).any():
+        raise ValueError("tracks: got a particle twice in a frame, allowed is once")
 
 
 def link(
@@ -121,16 +143,14 @@ def link(
     0      0   7.0   9.0   0.0         0
     1      2   7.8   9.4   0.0         0
     """
-    check_table("table", table, ["frame"])
+    frames_of("table", table)
     columns, ranges = positions_of("table", table), _search_range(search_range)
     whole("memory", memory, 0, 10_000)
     whole("min_rows", min_rows, 1, 2**31)
-    if table["frame"].dtype.kind not in "iu":
-        raise TypeError(f"table: got frames of type {table['frame'].dtype}, allowed are whole numbers")
     if isinstance(predictor, Flow):
         positive("frame_rate_hz", frame_rate_hz)
         _must_be_in_channel(table, predictor, ranges)
-    elif predictor not in (None, "nearest velocity"):
+    elif predictor is not None and not (isinstance(predictor, str) and predictor == "nearest velocity"):
         raise TypeError(f"predictor: got {predictor!r}, allowed are None, 'nearest velocity' and a Channel")
     if table.empty:
         return table.assign(particle=np.zeros(0, dtype=np.int64)).reset_index(drop=True)
@@ -242,7 +262,7 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float | None = None, *, wind
         If an argument is out of range, a column is missing, a standard deviation is not above 0, or a
         particle is in a frame twice.
     """
-    check_table("tracks", tracks, ["frame", "particle"])
+    must_be_tracks(tracks)
     columns = positions_of("tracks", tracks)
     stds = [f"{column[0]}_std{column[1:]}" for column in columns]
     weighted = set(stds) <= set(tracks)
@@ -250,8 +270,6 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float | None = None, *, wind
         raise ValueError(f"window: got {window}, allowed are odd numbers")
     if weighted and not (check_table("tracks", tracks, stds)[stds] > 0).all(axis=None):
         raise ValueError("tracks: got a standard deviation that is NaN or not above 0, allowed are those above 0")
-    if tracks.duplicated(["frame", "particle"]).any():
-        raise ValueError("tracks: got a particle twice in a frame, allowed is once")
     if frame_rate_hz is not None:
         t_s = tracks["frame"].to_numpy() / positive("frame_rate_hz", frame_rate_hz)
     elif "t_s" in tracks:
