@@ -224,7 +224,7 @@ class Calibration:
 
         beads = calibration.report.beads[["x_px", "y_px"]].to_numpy()
         order = np.argsort(z_um)
-        model, _ = learned(np.asarray(scan)[order], calibration.z_um, beads, calibration.size, field=field, modes=modes)
+        model, _ = learned(np.asarray(scan)[order], calibration.z_um, beads, size=size, field=field, modes=modes)
         return replace(calibration, learned=model)
 
     def __len__(self) -> int:

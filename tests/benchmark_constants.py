@@ -13,7 +13,7 @@ import pandas as pd
 
 from gdptlab import Calibration, assessment, batch, datasets
 from gdptlab.experiment import Microscope, sample_scan
-from gdptlab.pipeline import bead_images, beads, choose_settings, depth_quality, quality, settings
+from gdptlab.pipeline import beads, choose_settings, depth_quality, quality, settings
 
 SCANS = {"planar": 35, "synthetic": 61}
 """Size of the templates, px, with which they are calibrated, so that the search for a size is left out."""
@@ -71,8 +71,8 @@ def main() -> None:
         scan, z_um, frames, *_ = images(name)
         found = beads.find_beads(scan, z_um)
         for value in (0.03, 0.06, 0.12):
-            with changed(bead_images, "RIM", value):
-                print(f"bead_images.RIM = {value}: {name}: size {beads._size(scan, found)} px", flush=True)
+            with changed(pattern, "RIM", value):
+                print(f"pattern.RIM = {value}: {name}: size {beads._size(scan, found)} px", flush=True)
         made = Calibration.from_scan(scan, z_um, size=size)
         for value in (0.005, 0.01, 0.02, 0.04, 0.08):
             with changed(quality, "DIP", value):

@@ -34,7 +34,6 @@ from gdptlab.fit import Joint, PatternModel
 from gdptlab.fit.learning import learned
 from gdptlab.fit.noise import Pixels
 from gdptlab.fit.solver import Population
-from gdptlab.pipeline.beads import _size as scan_size
 from gdptlab.pipeline.beads import find_beads
 
 MICROSCOPE, CAMERA = Microscope(), Camera()
@@ -326,7 +325,7 @@ def model_of_stack(stack: NDArray, z_um: NDArray) -> PatternModel:
 def model_of_scan(scan: NDArray, z_um: NDArray) -> PatternModel:
     """Model of all beads of a scan, found in it."""
     beads = find_beads(scan, z_um)
-    return learned(scan, z_um, beads[["x_px", "y_px"]].to_numpy(), scan_size(scan, beads))[0]
+    return learned(scan, z_um, beads[["x_px", "y_px"]].to_numpy())[0]
 
 
 def joint(frame: NDArray, model: PatternModel, _: pd.DataFrame) -> pd.DataFrame:

@@ -175,6 +175,12 @@ def test_files_hold_what_was_written(tmp_path):
     assert arrays["n"].tolist() == [4, 1, 0, 0]  # x is the fastest
 
 
+def test_axes_may_be_whole_numbers_or_flags(tmp_path):
+    field = pd.DataFrame({"x_um": [0, 1, 0, 1], "z_um": [False, False, True, True], "n": range(4)})
+    save_paraview_field(field, tmp_path / "field.vtr")
+    assert decoded(tmp_path / "field.vtr")["z_um"].tolist() == [0, 1]
+
+
 def test_series_names_its_files_and_times(tmp_path):
     save_paraview_tracks(TABLE, tmp_path / "tracks.pvd", 25.0)
     text = (tmp_path / "tracks.pvd").read_text()

@@ -11,9 +11,9 @@ from gdptlab.fit.renderer import Columns
 BOUNDED = 3.0
 """Residuals beyond so many standard deviations pull no harder than these: light not yet explained is no background."""
 
-PRINT = False
 FINER = 5.0
-"""Factor by which finer knots must lower the smoothed residual to be taken."""
+"""Factor by which the finest knots must lower the smoothed residual for coarser ones to be given up. Particles that
+are not found yet make it 1.5 to 3, a background that changes over two templates 50 to 100."""
 
 EVERY = 3
 """Rows that are summed for the products of particles and background, both smooth over so many."""
@@ -120,8 +120,6 @@ def suitable(
     for surface in surfaces:
         smooth = cv2.GaussianBlur(residual - surface.fit(residual, weight), (0, 0), smooth_px)
         left.append(np.median(np.abs(smooth[weight > 0])))
-    if PRINT:
-        print("      surfaces", np.array(left) / left[-1])
     return int(np.argmax(np.array(left) <= FINER * left[-1]))
 
 

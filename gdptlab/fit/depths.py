@@ -75,7 +75,7 @@ class Alone:
             change /= np.maximum((np.abs(change[:, :4]) / (LONGEST * scale)).max(axis=1, keepdims=True), 1)
             trials = trials + change
             trials[:, 2] = np.clip(trials[:, 2], 0, self._renderer.count - 1)
-            trials[:, 3] = np.maximum(trials[:, 3], FAINTEST)
+            trials[:, 3] = np.maximum(trials[:, 3], FAINTEST * population.centre)
         matrix, _, gain = self._evaluated(trials, owner)
         return Trials(trials, gain - population.penalty(trials[:, 3]), matrix)
 

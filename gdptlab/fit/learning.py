@@ -25,7 +25,7 @@ from gdptlab._compiled import compiled, on_one_core
 from gdptlab.denoising import noise_level, noise_line
 from gdptlab.fit.background import Background
 from gdptlab.fit.model import ERROR_SCALE_PX, PatternModel, field_terms
-from gdptlab.fit.pattern import continued
+from gdptlab.fit.pattern import LARGEST, continued, image_size
 from gdptlab.fit.renderer import Columns, Renderer
 
 ALONE = 0.75
@@ -40,7 +40,7 @@ pattern. Chosen, between 0.05 and 2, by learning from half of a real scan's part
 its slices."""
 
 BELIEVED = 1.0
-"""Slices by which a particle's height may differ from the focal surface."""
+"""Slices by which a particle's height may differ from the focal surface until modes tell how particles differ."""
 
 SMOOTH = (1.0, 0.08)
 """Slices over which patterns are smoothed along z: at least, and as a fraction of the distance from focus. Where an
@@ -48,6 +48,12 @@ image is wide it changes slowly, but noise differs from slice to slice and makes
 
 SLICES = 35
 """Number of slices, evenly spread, from which positions are learned: neighbouring ones say much the same of them."""
+
+FIRST_STEPS = 2
+"""Gauss-Newton steps of the positions in each turn before modes are learned: positions may be off by pixels then."""
+
+SIZE_SLICES = 15
+"""Number of slices, evenly spread, in which the size of the images is sought."""
 
 NOISE_SLICES = 6
 """Number of slices, evenly spread, from whose residual the noise is learned: more than a million pixels."""
@@ -76,11 +82,11 @@ def learned(
     scan: ArrayLike,
     z_um: ArrayLike,
     beads_px: ArrayLike,
-    size: int,
     *,
+    size: int | None = None,
     field: bool | None = None,
     modes: int | None = None,
-    turns: int = 4,
+    turns: int = 3,
     learn_from: ArrayLike | None = None,
 ) -> tuple[PatternModel, pd.DataFrame]:
     """Learn the pattern model from a scan.
@@ -93,8 +99,9 @@ def learned(
         Depths, increasing, evenly spaced.
     beads_px : array (P, 2)
         About where the particles are: x, y, px, good to a few pixels.
-    size : int
-        Rows and columns of the widest image, odd.
+    size : int, optional
+        Rows and columns of the widest image, odd; found in the median of the particles' surroundings if not given,
+        in which neighbours do not show.
     field : bool, optional
         Whether the patterns change over the field; if not given, from PARTICLES_FOR_FIELD particles on.
     modes : int, optional
@@ -124,7 +131,8 @@ def learned(
         raise ValueError(f"z_um: got {len(steps) + 1} depths for {len(scan)} frames, needed are as many, 8 or more")
     if steps.min() <= 0 or np.ptp(steps) > 0.1 * steps.mean():
         raise ValueError(f"z_um: got steps from {steps.min():g} to {steps.max():g} µm, allowed are even ones above 0")
-    if whole("size", size, 5, min(scan.shape[1:])) % 2 == 0:
+    size = _median_size(scan, beads_px) if size is None else whole("size", size, 5, min(scan.shape[1:]))
+    if size % 2 == 0:
         raise ValueError(f"size: got {size}, allowed are odd numbers")
     learning = _Learning(scan, beads_px[:, ::-1].astype(float), size // 2, _chosen(scan, beads_px, size, learn_from))
     count = int(learning.chosen.sum())
@@ -138,12 +146,13 @@ def learned(
         )
     learning.begin(4 if field else 1)
     for turn in range(turns):
-        learning.learn_patterns(first=turn == 0)
-        learning.learn_places()
+        learning.learn_patterns(first=turn == 0, symmetric=True)
+        for _ in range(FIRST_STEPS):
+            learning.learn_places()
     learning.centre()
     if modes:
         learning.begin_modes(modes)
-    for _ in range(turns if modes else 1):
+    for _ in range(turns):
         learning.learn_patterns()
         learning.learn_coefficients()
         learning.learn_places()
@@ -162,6 +171,22 @@ def _chosen(scan: NDArray, beads_px: NDArray, size: int, learn_from: ArrayLike |
     return chosen & (np.minimum(beads_px, end - beads_px).min(axis=1) > size / 4)
 
 
+def _median_size(scan: NDArray[np.float32], beads_px: NDArray) -> int:
+    """Size of the widest image of the median particle, at most half of a frame."""
+    half = min(LARGEST // 2, min(scan.shape[1:]) // 4)
+    some = scan[:: max(len(scan) // SIZE_SLICES, 1)] - np.median(scan)
+    cuts = np.stack([_window(some, np.rint(place[::-1]).astype(int), half) for place in beads_px])
+    return max(image_size(np.median(cuts / np.abs(cuts).max(axis=(1, 2, 3), keepdims=True), axis=0)), 5)
+
+
+def _window(images: NDArray, place: NDArray[np.int64], half: int) -> NDArray:
+    """Part (N, 2 half + 1, 2 half + 1) of images about the pixel `place` (y, x); the edge is repeated beyond it."""
+    rows, columns = (
+        np.clip(np.arange(p - half, p + half + 1), 0, n - 1) for p, n in zip(place, images.shape[1:], strict=True)
+    )
+    return images[:, rows[:, None], columns]
+
+
 class _Learning:
     """A scan (N, rows, columns) and all that is known of it so far.
 
@@ -176,17 +201,20 @@ class _Learning:
         self.places = np.pad(places[self._order], ((0, 0), (0, 2)))
         self._background = Background(self.shape, 4 * half)
         self.noise = max(noise_level(scan[:: max(len(scan) // 10, 1)]), 1e-4 * float(np.ptp(scan))) or 1.0
-        self.line = np.array([0, self.noise**2])
+        self.line, self.believed = np.array([0, self.noise**2]), BELIEVED
+        self.levels = np.median(scan[:, ::4, ::4], axis=(1, 2))
 
     def begin(self, terms: int) -> None:
         """First amplitudes and heights, from the particles' small surroundings, and empty patterns."""
         near = max(self.half // 3, 2)
         cuts = np.stack([self._cut(self.scan, i, near) for i in range(len(self.places))])
-        cuts -= np.median(self.scan, axis=(1, 2))[:, None, None]
+        cuts -= self.levels[:, None, None]
         typical = np.median(cuts[self.chosen] / np.abs(cuts[self.chosen]).max(axis=(1, 2, 3), keepdims=True), axis=0)
         peak = np.abs(typical).max(axis=(1, 2))
-        inside = (np.abs(typical) > peak[:, None, None] / 2).sum(axis=(1, 2))
-        self.fine = 2 if np.sqrt(inside[peak > 0.7 * peak.max()].min() / np.pi) < SHARP_PX else 1
+        bright = np.abs(cuts[self.chosen])
+        inside = (bright > bright.max(axis=(2, 3), keepdims=True) / 2).sum(axis=(2, 3))
+        radius = np.sqrt(np.median(inside, axis=0)[peak > 0.5 * peak.max()].min() / np.pi)
+        self.fine = 2 if radius < SHARP_PX else 1
         self.middle = float((peak**4 @ np.arange(len(peak))) / (peak**4).sum())
         amplitude = np.einsum("pkij,kij->p", cuts, typical)
         self.places[:, 3] = np.maximum(amplitude / np.median(amplitude[self.chosen]), 0.02)
@@ -199,12 +227,8 @@ class _Learning:
         self.modes = np.zeros((0, len(self.scan), m, m), np.float32)
 
     def _cut(self, images: NDArray, i: int, half: int) -> NDArray:
-        """Part (N, 2 half + 1, 2 half + 1) of images about particle i, the edge repeated beyond the border."""
-        y, x = np.rint(self.places[i, :2]).astype(int)
-        rows, columns = (
-            np.clip(np.arange(p - half, p + half + 1), 0, n - 1) for p, n in zip((y, x), self.shape, strict=True)
-        )
-        return images[:, rows[:, None], columns]
+        """Part of images (N, rows, columns) about particle i."""
+        return _window(images, np.rint(self.places[i, :2]).astype(int), half)
 
     def _bring_to_surface(self) -> None:
         """Focal surface through the heights, which no outlier pulls; a height far off it is brought back."""
@@ -213,7 +237,8 @@ class _Learning:
             surface = np.linalg.lstsq(terms * trust[:, None], heights * trust, rcond=None)[0]
             trust = 1 / np.sqrt(np.maximum(1, np.abs(heights - terms @ surface) / 0.3))
         self.surface = np.pad(surface, (0, 4 - len(surface)))
-        self.heights = np.clip(self.heights, self.terms @ surface - BELIEVED, self.terms @ surface + BELIEVED)
+        smooth = self.terms @ surface
+        self.heights = np.clip(self.heights, smooth - self.believed, smooth + self.believed)
 
     def _renderer(self) -> Renderer:
         modes = self.modes if len(self.modes) else None
@@ -228,15 +253,16 @@ class _Learning:
         columns = renderer.draw(places, self.shape, self.heights, by_mode=by_mode)
         light = np.zeros(self.shape, np.float32)
         columns.add_to(light, places[:, 3])
-        rest = self.scan[k] - light
-        weight = self._weight(light, np.median(rest))
-        background = self._background.fit(rest, weight)
-        return columns, rest - background, self._weight(light, background), light + background
+        weight = self._weight(light + self.levels[k], light)
+        background = self._background.fit(self.scan[k] - light, weight)
+        self.levels[k] = background.mean()
+        return columns, self.scan[k] - light - background, weight, light + background
 
-    def _weight(self, light: NDArray[np.float32], background: NDArray[np.float32] | float) -> NDArray[np.float32]:
+    def _weight(self, model: NDArray[np.float32], light: NDArray[np.float32]) -> NDArray[np.float32]:
         """One over the variance of each pixel: of its noise and of the patterns' own error."""
-        variance = np.maximum(np.polyval(self.line, light + background), self.noise**2 / 4) + (MISFIT * light) ** 2
-        return (1 / variance).astype(np.float32)
+        slope, intercept = self.line.astype(np.float32)
+        variance = np.maximum(intercept + slope * model, np.float32(self.noise**2 / 4))
+        return 1 / (variance + np.square(np.float32(MISFIT) * light))
 
     def _residual(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Residual of all slices and its weight; what there is of photon noise is learned on the way."""
@@ -251,10 +277,12 @@ class _Learning:
 
     # ---------------- patterns
 
-    def learn_patterns(self, *, first: bool = False) -> None:
+    def learn_patterns(self, *, first: bool = False, symmetric: bool = False) -> None:
         """Add to the patterns, and to the modes, the residual around the particles.
 
-        In the `first` turn nobody's neighbours are known yet, and only particles without near ones are used.
+        In the `first` turn nobody's neighbours are known yet, and only particles without near ones are used. While
+        positions are rough, a mean pattern that is not `symmetric` under half a turn would keep them where they are:
+        it has a part for each bright particle that is off.
         """
         rest, weight = self._residual()
         chosen, count = self.chosen, self.terms.shape[1]
@@ -271,6 +299,29 @@ class _Learning:
             change[zone] = both[:count]
             self.modes[zone] = _along(smoother[slices][:, slices], self.modes[zone] + both[count:])
         self.patterns = _along(smoother, self.patterns + change)
+        if symmetric:
+            self.patterns[0] = (self.patterns[0] + self.patterns[0, :, ::-1, ::-1]) / 2
+        self._settle()
+
+    def _settle(self) -> None:
+        """Give back to positions and heights what the patterns' changes over the field, and the modes, took from them.
+
+        A change in proportion to the mean pattern's slope along x, say, draws particles aside that have another
+        position in truth. Heights keep what the modes tell of them: all particles of the scan are on one plane.
+        """
+        y, x, z = (-np.gradient(self.patterns[0], axis=axis) for axis in (1, 2, 0))
+        slopes = self.fine * y, self.fine * x, z
+        for slope, of in zip(slopes, (0, 1, None), strict=True):
+            power = float(np.vdot(slope, slope)) or 1.0
+            moved = np.array([np.vdot(slope, pattern) / power for pattern in self.patterns[1:]])
+            self.patterns[1:] -= moved.astype(np.float32)[:, None, None, None] * slope
+            shift_ = self.terms[:, 1:] @ moved
+            if of is None:
+                self.heights += shift_
+                continue
+            told = np.array([np.vdot(slope, mode) / power for mode in self.modes])
+            self.modes -= told.astype(np.float32)[:, None, None, None] * slope
+            self.places[:, of] += shift_ + self.places[:, 4:] @ told
 
     def _regressed(
         self,
@@ -350,7 +401,13 @@ class _Learning:
         return slices, half, np.s_[:, slices[0] : slices[-1] + 1, nodes, nodes]
 
     def begin_modes(self, count: int) -> None:
-        """Coefficients of the modes: principal components of the residual around the particles."""
+        """Coefficients of the modes: principal components of the residual around the particles.
+
+        From here on all particles are in focus on the focal surface, as those of a scan lie on a plane: how high one
+        seems to be beside it is part of how it differs. A larger one seems to be farther away.
+        """
+        self.believed = 0.0
+        self._bring_to_surface()
         (slices, half, zone), (rest, _), margin, around = self._zone(), self._residual(), 3, []
         for i, (place, height) in enumerate(zip(self.places, self.heights, strict=True)):
             low = np.clip(slices + int(np.floor(height)), 0, len(rest) - 2)

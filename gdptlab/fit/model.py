@@ -12,11 +12,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
 from gdptlab.calibration import Calibration
+from gdptlab.correlation import normalised
 from gdptlab.denoising import noise_level
 from gdptlab.fit.bounds import own_bias_um, own_error, recalibration_errors
 from gdptlab.fit.pattern import continued, particle_light
@@ -27,6 +29,9 @@ ALIKE = 0.85
 ERROR_SCALE_PX = 2.0
 """Scale, in px, on which the error of the patterns is compared with white noise; about the width of their finest
 details, and on this scale a matched filter sums pixels."""
+
+LOSSLESS = 0.98
+"""Patterns that keep this correlation with themselves at half resolution are sought there."""
 
 
 def field_terms(x_px: ArrayLike, y_px: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -108,6 +113,16 @@ class PatternModel:
     def modes_count(self) -> int:
         """Number of modes K."""
         return 0 if self.modes is None else len(self.modes)
+
+    @cached_property
+    def half_resolution(self) -> bool:
+        """Whether particles can be sought at half resolution: their images are hardly changed by it."""
+        trim = self.images.shape[-1] // 2 % 2
+        images = np.ascontiguousarray(
+            self.images[:, trim : len(self.images[0]) - trim, trim : len(self.images[0]) - trim]
+        )
+        restored = np.stack([cv2.pyrUp(cv2.pyrDown(image))[: image.shape[0], : image.shape[1]] for image in images])
+        return bool(np.einsum("kij,kij->k", normalised(restored), normalised(images)).min() >= LOSSLESS)
 
     @cached_property
     def images(self) -> NDArray[np.float32]:

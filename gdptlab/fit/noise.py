@@ -17,8 +17,8 @@ from gdptlab._compiled import compiled
 from gdptlab.denoising import noise_level
 
 ALONE = 3.0
-"""A pixel is hot (or dead) if it differs from the median around it by more than so many times what its second most
-different neighbour does. In the narrowest image that can be measured, 2 px wide, it is 2."""
+"""A pixel is hot (or dead) if it is above the lowest of its neighbours (below the highest) by more than so many times
+what its second highest (lowest) neighbour is. In an image 2 px wide at half height the brightest pixel is so by 3."""
 
 HOT = 8.0
 """And by more than so many standard deviations of the noise."""
@@ -76,7 +76,7 @@ def usable_pixels(frame: NDArray[np.float32], noise: float | None = None) -> Pix
 def _mend(frame, least, alone, filled, defective):  # pragma: no cover
     """Mark pixels that stand alone, and give them the median of their neighbours.
 
-    A pixel stands alone if all but one of its neighbours are far less away from their median.
+    A pixel stands alone if all but one of its neighbours are far less above the lowest (or below the highest) of them.
     """
     rows, columns = frame.shape
     around = np.empty(8, np.float32)
@@ -98,9 +98,9 @@ def _mend(frame, least, alone, filled, defective):  # pragma: no cover
                         count += 1
             ordered = np.sort(around[:count])
             middle = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
-            away = value - middle
-            second = ordered[count - 2] - middle if away > 0 else middle - ordered[1]
-            if abs(away) > least + alone * second:
+            hot = value - ordered[0] > least + alone * (ordered[count - 2] - ordered[0])
+            dead = ordered[count - 1] - value > least + alone * (ordered[count - 1] - ordered[1])
+            if hot or dead:
                 filled[r, c], defective[r, c] = middle, True
 
 

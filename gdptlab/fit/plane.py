@@ -1,4 +1,4 @@
-"""Which of two depths a particle has, when all particles are known to lie on one plane."""
+"""Which of two depths, where all particles are known to lie on one level plane."""
 
 import numpy as np
 import pandas as pd
@@ -7,8 +7,7 @@ from gdptlab._checks import table as check_table
 from gdptlab.fit.joint import AMBIGUOUS
 
 PLANE_UM = 1.0
-"""Standard deviation, um, of depths about the plane. Chosen: about the scatter of one particle; depths farther than
-three times this from the plane count as outliers."""
+"""Standard deviation, in um, of depths about the plane."""
 
 
 def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
@@ -20,7 +19,7 @@ def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
     Parameters
     ----------
     table : DataFrame
-        Of one frame, by the joint fit, with a calibration that leaves depths ambiguous.
+        Of one frame, from `Joint.table`.
 
     Returns
     -------
@@ -30,12 +29,12 @@ def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
 
     Raises
     ------
-    TypeError, ValueError
-        If it is no table, or a column is missing.
+    ValueError
+        If a column is missing.
     """
     check_table("table", table, ["z_um", "z_other_um", "log_ratio"])
     depths = table[["z_um", "z_other_um"]].to_numpy()
-    depths = np.where(np.isnan(depths), depths[:, :1], depths)  # without another depth there is nothing to choose
+    depths[:, 1] = np.where(np.isfinite(depths[:, 1]), depths[:, 1], depths[:, 0])  # one depth only: it is both
     if not len(depths):
         return table.copy()
     planes = np.arange(depths.min(), depths.max() + 0.1, 0.1)
@@ -44,6 +43,8 @@ def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
     plane = planes[off.min(axis=2).sum(axis=1).argmin()]
     swap = np.abs(depths[:, 1] - plane) < np.abs(depths[:, 0] - plane)
     table = table.copy()
-    table["z_um"], table["z_other_um"] = np.where(swap, depths.T[::-1], table[["z_um", "z_other_um"]].to_numpy().T)
+    table["z_um"], table["z_other_um"] = (
+        np.where(swap, table[other], table[own]) for own, other in (("z_um", "z_other_um"), ("z_other_um", "z_um"))
+    )
     table["log_ratio"] = np.where(swap, -table["log_ratio"], table["log_ratio"])
     return table

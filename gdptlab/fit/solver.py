@@ -28,8 +28,8 @@ LONG = 0.2
 DAMPING = 1e-3
 """Fraction by which the diagonal is raised (Levenberg)."""
 
-FAINTEST = 0.5
-"""Least amplitude, over that which makes a pattern as high as the noise of a pixel."""
+FAINTEST = 0.005
+"""Least amplitude, as a fraction of the population's median."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Fit:
 
     @property
     def energy(self) -> NDArray[np.float64]:
-        """Weighted squares of each particle's pattern, (P,): what the frame would tell of its amplitude were it alone."""
+        """Weighted squares of each particle's pattern, (P,): one over the variance of its amplitude were it alone."""
         return self._in_order(self._system.alone)
 
     @cached_property
@@ -212,7 +212,7 @@ def fitted(
             background = background + surface.surface(shift)
         places[order, :4] += change / np.maximum(fraction.max(axis=1, keepdims=True), 1)
         places[:, 2] = np.clip(places[:, 2], 0, renderer.count - 1)
-        places[:, 3] = np.maximum(places[:, 3], FAINTEST)
+        places[:, 3] = np.maximum(places[:, 3], FAINTEST * population.centre)
         longest = fraction.max(initial=0)
         if longest > LONG:
             system = None

@@ -5,7 +5,6 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_smoothing_spline
-from scipy.ndimage import median
 from scipy.ndimage import shift as shift_image
 from skimage.registration import phase_cross_correlation
 
@@ -13,10 +12,7 @@ from gdptlab._checks import depths, positive, real_array
 from gdptlab._compiled import on_one_core
 from gdptlab.calibration import levelled
 from gdptlab.denoising import denoised, noise_level
-
-LARGEST = 121
-"""Largest size of a template, px, that is chosen unasked in frames of 500 px; see `largest_size`. Chosen: twice that of
-the paper's, and four times that of the planar beads; time to calibrate grows with its square."""
+from gdptlab.fit.pattern import image_size, largest_size
 
 RECENTRED = 4
 """Largest number of times that a particle is cut out anew about the centre that was found. Derived: each time the first
@@ -26,19 +22,9 @@ STANDS_OUT = 4.0
 """Height of a particle, in standard deviations of a pixel's noise, from which on it is one. Derived: the highest of the
 thousand pixels of a window without a particle, denoised, stays below 4."""
 
-RIM = 0.06
-"""Brightness of a ring, as a fraction of the brightest, below which an image has ended. Chosen on the planar and the
-synthetic scan between 0.03 and 0.12, where templates have 37, 35, 33 and 79, 71, 45 px: the larger lose particles in a
-crowd and at the border, the smaller cut off faint rings that tell depths apart."""
-
 MARGIN = 8
 """Margin about a window that is moved, px, for the spline and for a particle that drifts. Derived: a cubic spline's
 response falls by 0.27 from pixel to pixel, to 3e-5 over 8."""
-
-
-def largest_size(shape: tuple[int, int]) -> int:
-    """Largest size of a template that is chosen unasked: `LARGEST`, or in large frames a quarter of a side, odd."""
-    return max(LARGEST, min(shape) // 8 * 2 + 1)
 
 
 @on_one_core
@@ -117,25 +103,6 @@ def centred(
         for image, (x, y) in zip(cut_out(scan, x_px, y_px, size // 2 + margin), centres, strict=True)
     ]
     return np.stack(stack)[:, margin:-margin, margin:-margin], centres
-
-
-def image_size(cut: NDArray) -> int:
-    """Smallest odd size that holds the particle in nearly every slice of (N, 2 r + 1, 2 r + 1).
-
-    An image ends where the median over a ring about the centre, which a neighbour does not move, first falls
-    below the fraction `RIM` of the brightest ring's.
-    """
-    half = cut.shape[-1] // 2
-    y, x = np.indices(cut.shape[1:]) - half
-    ring = np.rint(np.hypot(x, y)).astype(int)
-    radius = []
-    for image in denoised(cut):
-        above = image - np.median(np.concatenate([image[[0, -1]].ravel(), image[:, [0, -1]].ravel()]))
-        profile = np.abs(median(above, ring, np.arange(half + 1)))
-        brightest = int(profile.argmax())
-        faint = np.flatnonzero(profile[brightest:] < RIM * profile[brightest])
-        radius.append(brightest + int(faint[0]) if len(faint) else half)
-    return 2 * int(np.percentile(radius, 95)) + 1
 
 
 def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) -> NDArray[np.float64]:

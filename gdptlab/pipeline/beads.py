@@ -26,8 +26,9 @@ from gdptlab.assessment import match
 from gdptlab.calibration import Calibration, levelled
 from gdptlab.correlation import normalised, vertex
 from gdptlab.denoising import denoised, noise_level
+from gdptlab.fit.pattern import image_size, largest_size
 from gdptlab.locate import locate
-from gdptlab.pipeline.bead_images import MARGIN, centred, image_size, largest_size
+from gdptlab.pipeline.bead_images import MARGIN, centred
 
 STANDS_OUT = 8.0
 """Height of a spot above its surroundings, in standard deviations of the smoothed image, from which on it is a bead's.

@@ -85,7 +85,7 @@ def save_paraview_field(field: pd.DataFrame, path: str | os.PathLike[str]) -> No
     path = _path(path, ".vtr")
     axes = [name for name in POSITION if name in check_table("field", field, ())]
     check_table("field", field, axes)
-    middles = {name: np.unique(field[name]) for name in axes}
+    middles = {name: np.unique(field[name].astype(float)) for name in axes}
     if not axes or len(field) != np.prod([len(middle) for middle in middles.values()]) or field.duplicated(axes).any():
         raise ValueError("field: got rows that are not the cells of a grid, allowed is a table from `mean_field`")
     field = field.sort_values(axes[::-1])  # VTK's first axis is the fastest
