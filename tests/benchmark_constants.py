@@ -11,6 +11,7 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 
+import gdptlab.fit.pattern as pattern
 from gdptlab import Calibration, assessment, batch, datasets
 from gdptlab.experiment import Microscope, sample_scan
 from gdptlab.pipeline import beads, choose_settings, depth_quality, quality, settings

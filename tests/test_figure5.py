@@ -64,7 +64,8 @@ def test_settings_are_compared_film_by_film() -> None:
     errors["failed"] = (errors.n == 6) & (errors.seed < 10)
     mean, low, high = figure5.paired_difference(errors, "n == 6", "n == 51")
     assert mean == 0.5 and 0.2 < low < 0.4 < 0.6 < high < 0.8
-    assert figure5.paired_difference(errors, "n == 6", "n == 6") == (0, 0, 0)
+    mean, low, high = figure5.paired_difference(errors, "n == 6", "n == 6")
+    assert mean == 0 and -0.15 < low < -0.1 < 0.1 < high < 0.15  # 20 films cannot show that there is no difference
 
 
 def test_a_shorter_film_shows_the_same_particles() -> None:

@@ -5,7 +5,7 @@ import pytest
 from conftest import SIZE_PX, Z_UM, table
 from scipy.interpolate import BSpline
 
-from gdptlab.experiment.image_types import Camera
+from gdptlab.experiment.camera import Camera
 from gdptlab.fit.model import field_terms
 from gdptlab.fit.renderer import Renderer, along_z, draw_error, energy_beside_errors
 

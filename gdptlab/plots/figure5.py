@@ -61,7 +61,6 @@ def fig5_times(points: pd.DataFrame, band: pd.DataFrame, colour: str, letters: s
     figure, axes = panels(2, 10, 5.2, rows=2, height_ratios=[1, 3.4], sharex=True)
     colours = dict(zip(points[colour].drop_duplicates(), COLOURS, strict=False))
     markers = dict(zip(points["evaluator"].drop_duplicates(), MARKERS, strict=False))
-    films = int(points["films"].max())
     for k, (trigger, symbol) in enumerate(TRIGGERS.items()):
         strip, panel = axes[:, k]
         _band(panel, band)
@@ -83,7 +82,9 @@ def fig5_times(points: pd.DataFrame, band: pd.DataFrame, colour: str, letters: s
         Line2D([], [], color="0.3", marker="o", ls="", mfc="white", label="not refined"),
         Rectangle((0, 0), 1, 1, color=BAND, label="delay of a perfect monitor (line: mean)"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small", title=f"{films} films")
+    films = points.groupby("evaluator", sort=False)["films"].max()
+    title = ", ".join(f"{name}: {number} films" for name, number in films.items())
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small", title=title)
     return figure
 
 
