@@ -25,11 +25,19 @@ SMALL = {
     "06b": {"n_films_accuracy": 1, "until_s": 0.6, "phases": 1},
     "07": {"n_subs": (4, 9), "counts": (10,), "sizes_px": (31,), "frames_px": (256,), "frames_scikit_px": (256,)}
     | {"rounds": 1, "film_s": 0.4, "processes": (1,), "point_s": 0.01},
-    "08": {"counts": (10, 50), "n_frames": 1, "n_isolated": 1, "n_types": 1, "film_s": 4.0, "n_films": 1, "every": 25},
-    "09": {"hold_out_frames": [0], "other_beads_px": [(82, 304)], "n_jobs": 1},
-    "10": {"n_beads": 4, "n_frames": 2, "crowds": (25,), "noises": (38.0,), "n_crowded": 1},
+    "08": {
+        "counts": (10, 50),
+        "n_frames": 1,
+        "n_types": 1,
+        "n_spread": 1,
+        "spreads": (0.0, 0.6),
+        "spread_counts": (50,),
+    },
+    "08b": {"counts": (50,), "n_frames": 1, "n_isolated": 1, "film_s": 4.0, "n_films": 1, "every": 25},
+    "09": {"n_others": 1, "n_jobs": 1, "modes": 0},
+    "10": {"n_beads": 4, "n_frames": 2, "crowds": (25,), "noises": (38.0,), "n_crowded": 2},
     "11": {"duration_s": 3.0, "factors": (1,), "n_films": 3, "n_jobs": 1},
-    "12": {"rate_s": 1.0, "fast_s": 0.5, "flood_s": 0.5, "n_loops": 1, "ahead": 25},
+    "12": {"rate_s": 1.0, "fast_s": 0.5, "flood_s": 0.5, "n_loops": 1, "n_joint": 3, "ahead": 25},
 }
 """Settings of size, by the number of the notebook."""
 
@@ -59,7 +67,8 @@ CHANGED = [
     ("06b", {"densities": (10.0, 60.0)}),
     ("06b", {"until_s": 1.0, "every": 10}),
     ("07", {"n_sub": 6, "count": 30, "mean_in_view": 50.0}),
-    ("08", {"count": 60, "count_types": 50, "mean_in_view": 50.0, "seed": 9}),
+    ("08", {"count": 60, "count_types": 50, "seed": 9}),
+    ("08b", {"mean_in_view": 50.0, "seed": 9}),
     ("09", {"n_sub": 7, "threshold": 0.6}),
     ("10", {"noise": 60.0, "seed": 5}),
     ("11", {"E_ac": 2.4, "mean_in_view": 30.0, "crowd_in_view": 60.0}),

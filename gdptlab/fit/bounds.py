@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.linalg import eigh
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import spline_filter1d, uniform_filter1d
 
 from gdptlab._checks import positive
 from gdptlab.calibration import Calibration
@@ -151,9 +151,13 @@ def _without_noise(fisher: NDArray[np.float64], noise: NDArray[np.float64]) -> N
 
 
 def _derivatives(images: NDArray, z_um: NDArray) -> NDArray[np.float64]:
-    """How each image changes with x, y, z, amplitude and background: (N, n * n, 5)."""
+    """How each image changes with x, y, z, amplitude and background: (N, n * n, 5).
+
+    Slopes in the image are those of the cubic spline through its pixels: differences of pixels would make them smaller
+    where the particle is in focus, and the bound up to 1.3 times too high.
+    """
     images = images.astype(np.float64)
-    down, across = (np.gradient(images, axis=axis) for axis in (1, 2))
+    down, across = (np.gradient(spline_filter1d(images, axis=axis), axis=axis) for axis in (1, 2))
     along_z = np.gradient(images, z_um, axis=0)
     columns = np.stack([-across, -down, along_z, images, np.ones_like(images)], axis=-1)
     return columns.reshape(len(images), -1, 5)

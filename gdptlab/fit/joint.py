@@ -421,6 +421,8 @@ class _Search:
     def take_out(self, which: NDArray[np.bool_]) -> None:
         """Go on without those."""
         self.places = self.places[~which]
+        self._stays = self._stays.copy()
+        self._stays[np.flatnonzero(self._stays)[which]] = False
         self._image = self._joint._small.renderer.image(self.places, self._frame.shape)
 
 
