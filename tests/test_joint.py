@@ -397,7 +397,7 @@ def test_amplitudes_that_differ_tenfold(calibration, tenfold):
 
 @pytest.mark.parametrize("unit", [1 / 20, 1e-3, 1e4])
 def test_the_unit_of_counts_does_not_matter(calibration, tenfold, unit):
-    """Rounded otherwise, one or two doubtful particles may come out otherwise; all others agree to a small part of their errors."""
+    """Rounding may change one or two doubtful particles; all others agree to a small fraction of their errors."""
     frame = tenfold[1].astype(np.float32)
     plain, scaled = joint(frame, calibration), joint(frame * np.float32(unit), calibration)
     pairs = match(scaled, plain, within_px=0.03, within_um=0.1)
