@@ -76,13 +76,6 @@ def beads_correlation() -> pd.DataFrame:
     return batch(beads.frames[[2, 8]], Calibration.from_scan(beads.scan, beads.z_um), progress=False)
 
 
-def beads_over_field() -> pd.DataFrame:
-    """A quarter of the field of the real beads, calibrated with all beads in it."""
-    beads = datasets.planar_beads()
-    calibration = Calibration.from_scan(beads.scan[::2, :288, :288], beads.z_um[::2], field=True)
-    return locate(beads.frames[8, :288, :288], calibration, method="joint")
-
-
 TABLES: dict[str, Callable[[], pd.DataFrame]] = {
     **{f"refined-{t}": lambda t=t: correlation(t, refine=True) for t in IMAGE_TYPES},
     **{f"unrefined-{t}": lambda t=t: correlation(t, refine=False) for t in IMAGE_TYPES},
@@ -90,7 +83,6 @@ TABLES: dict[str, Callable[[], pd.DataFrame]] = {
     "replay-errors": replayed,
     "velocities": tracked,
     "beads-correlation": beads_correlation,
-    "beads-over-field": beads_over_field,
 }
 """What is stored, by name; those of the beads need other people's images."""
 

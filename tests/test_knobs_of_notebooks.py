@@ -12,6 +12,7 @@ from types import ModuleType
 import matplotlib.pyplot as plt
 import nbformat
 import pytest
+from conftest import THOROUGH
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
@@ -102,6 +103,8 @@ def execute(path: Path, changed: dict[str, object]) -> None:
 def test_a_changed_notebook_runs_to_its_end(
     number: str, changed: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if number >= "07" and not THOROUGH:
+        pytest.skip("takes minutes: GDPTLAB_THOROUGH=1 pytest tests/test_knobs_of_notebooks.py")
     if number == "09" and not os.environ.get("GDPTLAB_DATA"):
         pytest.skip("needs the images of another group")
     (path,) = NOTEBOOKS.glob(f"{number}-*.ipynb")

@@ -1,11 +1,10 @@
 """Matched filter: lone particles and their gain, crowds with and without whitening, noise."""
 
+import cv2
 import numpy as np
 import pytest
-from conftest import Z_UM
 from test_renderer import crowd, drawn
 
-from gdptlab import Calibration
 from gdptlab.fit.renderer import Renderer
 from gdptlab.fit.search import SIDE_LOBE, MatchedFilter
 from gdptlab.fit.solver import Population
@@ -18,7 +17,7 @@ TRUE_PX = 3.0  # a place found is one of a particle
 @pytest.fixture(scope="module")
 def images(clean_stack):
     """Light of a particle at each depth, at the resolution of the search."""
-    return Calibration.from_stack(clean_stack, Z_UM).at_search_resolution((clean_stack - 500).astype(np.float32))
+    return np.stack([cv2.pyrDown(image) for image in (clean_stack - 500).astype(np.float32)])
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,9 @@ HOT = 8.0
 PLATEAU = 4
 """Fewest pixels at the highest value for it to be the top of the camera's range."""
 
-LEAST_NOISE = 1e-5
-"""Least noise, as a fraction of the range of a frame's values, of frames that were computed without."""
+LEAST_NOISE = 1e-4
+"""Least noise of frames that were computed without noise, as a fraction of the range of their values. Convention:
+rounding to 16 bits alone makes a tenth of it in frames that fill the range."""
 
 BINS = 12
 """Bins of the model image in which the variance of the residual is estimated."""

@@ -33,7 +33,7 @@ def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
         If a column is missing.
     """
     check_table("table", table, ["z_um", "z_other_um", "log_ratio"])
-    depths = table[["z_um", "z_other_um"]].to_numpy()
+    depths = table[["z_um", "z_other_um"]].to_numpy(copy=True)
     depths[:, 1] = np.where(np.isfinite(depths[:, 1]), depths[:, 1], depths[:, 0])  # one depth only: it is both
     if not len(depths):
         return table.copy()
