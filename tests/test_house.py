@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 import gdptlab
@@ -148,3 +149,12 @@ def test_files_named_in_code_style_exist() -> None:
             r"\b(?:tests|notebooks|data|figures|gdptlab)/[\w./-]+\.\w+", path.read_text(encoding="utf-8")
         ):
             assert (ROOT / name).exists(), name
+
+
+def test_readme_has_the_verdict_of_the_claims() -> None:
+    """README and notebook 06b cannot disagree."""
+    claims = pd.read_csv(ROOT / "figures" / "claims.csv")
+    count = claims["holds"].value_counts()
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"{count['yes']} yes, {count['partly']} partly, {count['no']} no" in readme
+    assert claims["measured"].iloc[0] in readme
