@@ -297,8 +297,17 @@ class Calibration:
         return flat @ flat.T
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the calibration to a `.npz` file, whole or not at all."""
+        """Write the calibration to a `.npz` file, whole or not at all.
+
+        Raises
+        ------
+        ValueError
+            If the name does not end in .npz, or the calibration has patterns learned from a whole scan (`learned`):
+            the file has no place for them, and without them it would measure otherwise.
+        """
         path = Path(path)
+        if self.learned is not None:
+            raise ValueError("path: got a calibration with `learned` patterns, allowed is one without; learn it again")
         if path.suffix != ".npz":
             raise ValueError(f"path: got {path.name!r}, allowed are names that end in .npz")
         with written_whole(path) as temporary:

@@ -3,6 +3,7 @@
 import pickle
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -547,3 +548,9 @@ def test_a_particle_cut_by_the_border_is_refused(microscope) -> None:
 
 def test_a_calibration_says_what_it_is(calibration) -> None:
     assert repr(calibration).startswith("<Calibration: 51 images of 61 by 61 px, z = -50 to 50 µm, 9 in the subset")
+
+
+def test_learned_patterns_are_not_lost_without_a_word(calibration, tmp_path):
+    with pytest.raises(ValueError, match=r"^path:"):
+        replace(calibration, learned=calibration.model).save(tmp_path / "a.npz")
+    assert not list(tmp_path.iterdir())

@@ -50,7 +50,10 @@ def in_um(table: pd.DataFrame, um_per_px: float) -> pd.DataFrame:
 def fingerprint(calibration: Calibration) -> str:
     """Hexadecimal SHA-256 of all that a calibration measures with."""
     digest = hashlib.sha256()
-    for part in (calibration.stack, calibration.z_um, calibration.subset, calibration.templates):
+    parts = [calibration.stack, calibration.z_um, calibration.subset, calibration.templates]
+    if calibration.learned is not None:
+        parts += [calibration.learned.patterns, calibration.learned.surface]
+    for part in parts:
         digest.update(f"{part.dtype.str}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
     return digest.hexdigest()
 
