@@ -5,7 +5,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.fft import dct, dctn, idctn
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
-from scipy.optimize import nnls
 
 from gdptlab._compiled import on_one_core
 
@@ -142,6 +141,8 @@ def noise_line(noise: NDArray, smooth: NDArray) -> NDArray[np.float64]:
         Slope, 0 or above, and intercept, for `numpy.polyval`; at every value in `smooth` the variance is above 0, but
         of images without noise.
     """
+    from scipy.optimize import nnls  # here, as it takes long to import
+
     size = np.abs(_mixed_differences(noise)).ravel()
     value = (smooth[..., 1:, 1:] + smooth[..., 1:, :-1] + smooth[..., :-1, 1:] + smooth[..., :-1, :-1]).ravel() / 4
     bins = np.array_split(np.argsort(value), max(min(len(value) // LEAST_IN_BIN, 200), 1))
