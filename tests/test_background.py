@@ -101,7 +101,7 @@ def test_knots_suit_the_frame(period, chosen):
         y, x = (rng.integers(10, side - 10) for side in SHAPE)
         frame[y - 6 : y + 7, x - 6 : x + 7] += 800
     surfaces = [Background(SHAPE, knot) for knot in (120.0, 60.0, 15.0)]
-    assert suitable(surfaces, frame.astype(np.float32), uniform(), 4.0) == chosen
+    assert suitable(surfaces, frame.astype(np.float32), uniform(), 4.0, 5.0) == chosen
 
 
 # -------------------- sums

@@ -73,8 +73,8 @@ def test_without_noise_exactly(shapes, surface):
     background = surface.surface(np.linspace(400, 600, surface.matrix(WEIGHT).shape[0]))
     frame = drawn(shapes, true, SHAPE) + background
     result = fit(shapes, frame, true + np.array((0.5, -0.5, 1, 0.05)), surface=surface, steps=25)
-    np.testing.assert_allclose(result.places, true, atol=1e-2)
-    np.testing.assert_allclose(result.background, background, atol=NOISE / 3)  # damped, it is slow at the corners
+    np.testing.assert_allclose(result.places, true, atol=2e-3)
+    np.testing.assert_allclose(result.background, background, atol=NOISE / 50)
     np.testing.assert_allclose(result.image + result.background + result.residual, frame, atol=0.01)
 
 
@@ -107,9 +107,9 @@ def test_errors_are_as_large_as_they_are_said_to_be(shapes, surface):
 @pytest.mark.parametrize("with_surface", [True, False])
 @pytest.mark.parametrize("n", [1, 2, 12])
 def test_std_is_that_of_the_dense_inverse(shapes, surface, n, with_surface):
-    """Of the normal matrix of particles and background; products of the two are good to a few per cent.
+    """Of the normal matrix of particles and background.
 
-    Damping makes deviations smaller than they are, that of the background by some more in so small a frame.
+    Damping makes deviations slightly smaller than they are.
     """
     places, spread = crowd(SHAPE, n, n + 7), 0.05
     frame = drawn(shapes, places, SHAPE) + (behind() if with_surface else 0) + noise(8)
@@ -121,10 +121,10 @@ def test_std_is_that_of_the_dense_inverse(shapes, surface, n, with_surface):
     matrix = columns.T.astype(float) @ columns / NOISE**2
     matrix[np.arange(3, 4 * n, 4), np.arange(3, 4 * n, 4)] += (spread * result.places[:, 3]) ** -2
     damped = matrix.copy()
-    damped[np.diag_indices(len(matrix))] *= np.r_[np.full(4 * n, 1 + DAMPING), np.full(len(matrix) - 4 * n, 1.03)]
+    damped[np.diag_indices(len(matrix))] *= np.r_[np.full(4 * n, 1 + DAMPING), np.full(len(matrix) - 4 * n, 1 + DAMPING)]
     expected, largest = (np.sqrt(np.diag(np.linalg.inv(m))[: 4 * n].reshape(-1, 4)[:, :3]) for m in (damped, matrix))
-    np.testing.assert_allclose(result.std, expected, rtol=0.1 if with_surface else 0.03)
-    assert (result.std > 0.75 * largest).all()
+    np.testing.assert_allclose(result.std, expected, rtol=0.03)
+    assert (result.std > 0.95 * largest).all()
 
 
 def test_neighbours_cost_accuracy(shapes):

@@ -11,13 +11,6 @@ from gdptlab.fit.renderer import Columns
 BOUNDED = 3.0
 """Residuals beyond so many standard deviations pull no harder than these: light not yet explained is no background."""
 
-FINER = 5.0
-"""Factor by which the finest knots must lower the smoothed residual for coarser ones to be given up. Particles that
-are not found yet make it 1.5 to 3, a background that changes over two templates 50 to 100."""
-
-EVERY = 3
-"""Rows that are summed for the products of particles and background, both smooth over so many."""
-
 
 class Background:
     """Cubic spline surface for frames of one shape.
@@ -74,30 +67,38 @@ class Background:
         return down @ coefficients.reshape(down.shape[1], -1).astype(np.float32) @ across.T
 
     def products(self, columns: Columns, weight: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Weighted products (4 P, B) of the particles' columns with the splines of the surface, to a few per cent."""
+        """Weighted products (4 P, B) of the particles' columns with the splines of the surface."""
+        count, (down, across) = len(columns.boxes), self._along
+        out = np.zeros((4 * count, down.shape[1] * across.shape[1]))
+        self.renew(out, columns, weight, np.ones(count, bool))
+        return out
+
+    def renew(
+        self, products: NDArray[np.float64], columns: Columns, weight: NDArray[np.float32], moved: NDArray[np.bool_]
+    ) -> None:
+        """Compute the rows of `products` anew of the particles that `moved` (P,)."""
         down, across = self._along
-        out = np.zeros((4 * len(columns.boxes), down.shape[1], across.shape[1]))
         rows = (np.ascontiguousarray(along.T) for along in (down, across))
-        _products(columns.boxes, columns.starts, columns.values, weight, *rows, out)
-        return out.reshape(len(out), -1)
+        out = products.reshape(-1, 4, down.shape[1], across.shape[1])
+        out[moved] = 0
+        _products(columns.boxes, columns.starts, columns.values, weight, *rows, np.flatnonzero(moved), out)
 
 
 @compiled
-def _products(boxes, starts, values, weight, down, across, out):  # pragma: no cover
+def _products(boxes, starts, values, weight, down, across, which, out):  # pragma: no cover
     """`down` (splines, rows) and `across` (splines, columns) as rows, so that the long loops are over pixels."""
     seen = np.empty(across.shape[1], np.float32)
-    for i in range(len(boxes)):
+    for i in which:
         y0, y1, x0, x1 = boxes[i]
         if y1 <= y0 or x1 <= x0:
             continue
-        width, first = x1 - x0, y0 + ((y1 - y0) % EVERY != 1)
+        width = x1 - x0
         for c in range(4):
-            for r in range(first, y1, EVERY):
+            for r in range(y0, y1):
                 k = starts[i] + (r - y0) * width
-                each = np.float32(min(r + 2, y1) - max(r - 1, y0))  # it stands for its neighbours, too
                 column, trust = values[c, k:], weight[r, x0:]
                 for q in range(width):
-                    seen[q] = each * column[q] * trust[q]
+                    seen[q] = column[q] * trust[q]
                 for b in range(len(across)):
                     if across[b, x0] == 0 and across[b, x1 - 1] == 0:  # few of the splines reach the box
                         continue
@@ -105,13 +106,17 @@ def _products(boxes, starts, values, weight, down, across, out):  # pragma: no c
                     for q in range(width):
                         total += seen[q] * spline[q]
                     for a in range(len(down)):
-                        out[4 * i + c, a, b] += down[a, r] * total
+                        out[i, c, a, b] += down[a, r] * total
 
 
 def suitable(
-    surfaces: list[Background], residual: NDArray[np.float32], weight: NDArray[np.float32], smooth_px: float
+    surfaces: list[Background],
+    residual: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    smooth_px: float,
+    finer: float,
 ) -> int:
-    """Index of the coarsest of several surfaces, from coarse to fine, that leaves hardly more than the finest.
+    """Index of the coarsest of several surfaces, from coarse to fine, that leaves at most `finer` times the finest's.
 
     Compared is the median size of what is left (rows, columns), smoothed over `smooth_px`: noise is little there, and
     particles that are not found yet are on few pixels.
@@ -120,7 +125,7 @@ def suitable(
     for surface in surfaces:
         smooth = cv2.GaussianBlur(residual - surface.fit(residual, weight), (0, 0), smooth_px)
         left.append(np.median(np.abs(smooth[weight > 0])))
-    return int(np.argmax(np.array(left) <= FINER * left[-1]))
+    return int(np.argmax(np.array(left) <= finer * left[-1]))
 
 
 def _splines(n: int, spans: int) -> NDArray[np.float32]:

@@ -140,7 +140,8 @@ def _sums(
         mine, bright = np.float32(amplitude[owner[i]]), np.float32(trial[i])
         y0, y1, x0, x1 = t_boxes[i]
         a0, a1, b0, b1 = boxes[o]
-        used = size if np.any(t_values[4:, t_starts[i] : t_starts[i + 1]]) else 4
+        pixels = max(y1 - y0, 0) * max(x1 - x0, 0)
+        used = size if np.any(t_values[4:, t_starts[i] : t_starts[i] + pixels]) else 4
         for r in range(y0, y1):
             s, inside = t_starts[i] + (r - y0) * (x1 - x0), a0 <= r < a1
             for c in range(x0, x1):

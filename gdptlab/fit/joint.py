@@ -29,11 +29,14 @@ BLUR = 1 / 20
 SHARP_GAIN = 2.0
 """Log-likelihood that a particle must add in high-passed frames: little, as wide images have little to show there."""
 
-CYCLES = 4
+CYCLES = 2
 """Largest number of searches, each without what was odd after the one before."""
 
-ROUNDS = 5
+ROUNDS = 8
 """Largest number of times that further particles are sought in one search."""
+
+FEW = 0.02
+"""Fraction by which particles must become more in a round for another one to follow."""
 
 SEARCH_STEPS, STEPS = 2, 5
 """Largest numbers of Gauss-Newton steps after each round of the search, and at full resolution."""
@@ -41,8 +44,13 @@ SEARCH_STEPS, STEPS = 2, 5
 REFITS = 6
 """Largest number of fits at full resolution, each without the particles that added too little in the one before."""
 
-KNOTS = (2.0, 1.0, 0.5)
+KNOTS = (8.0, 2.0, 1.0, 0.5)
 """Distances between the knots of the background that are tried, in templates."""
+
+FINER, CLEARLY_FINER = 15.0, 2.0
+"""Factors by which the finest knots must lower the smoothed residual for coarser ones to be given up: during the
+search, where particles that are not found yet make it up to 5 and a background that changes over two templates 48 to
+110; and once particles are fitted."""
 
 ASTRAY = np.array([-4.0, 0.0, 4.0])
 """Slices by which the depth on the other side of focus may be off the one that looks most alike."""
@@ -72,7 +80,7 @@ FOREIGN_UNUSUAL = 1.5, 4.0
 """Lower chi-square from which on a row is none if its amplitude is, by so many standard deviations, unusual as well.
 Chosen on frames with debris and dust: nearly all false rows are beyond, and 1 % of the true ones."""
 
-LEAST_SIGMA = 0.03
+LEAST_SIGMA = 0.06
 """Least standard deviation of the logarithm of amplitudes for that."""
 
 LOST = 0.2
@@ -169,14 +177,20 @@ class Joint:
             total = self._full.error_variance(fit.places, self.shape)
             gain = self._full.gain(fit, weight, total)
             stays = self._full.staying(gain, fit.places, LEAST_GAIN)
-            if again and stays.all():
+            excess = self._full.excess(fit, weight, total)
+            merged = self._full.merged(fit.places[stays], excess[stays])
+            if again and len(merged) == len(fit.places):
                 break
             population, background = learned_population(fit, stays, population), fit.background
             new = self._unexplained(fit, weight, total, population) if again < 2 else places[:0]
             variance = learned_variance(fit.image, fit.residual, 1.0)
             weight = variance.weight(fit.image, pixels.valid)
-            places = np.concatenate([self._likelier(fit, variance, pixels)[stays], new])
-        excess = self._full.excess(fit, weight, total)
+            if again == 0:
+                flat = self.reduced(frame - fit.image)
+                chosen = suitable(self._small_backgrounds, flat, self.reduced(weight), self._blur, CLEARLY_FINER)
+                surface, background = chosen, background if chosen == surface else None
+            likelier = self._likelier(fit, variance, pixels)[stays]
+            places = np.concatenate([self._full.merged(likelier, excess[stays]), new])
         velocity = np.zeros((len(fit.places), 3))
         return Explained(fit, stays, fit.places, velocity, population, surface, variance, pixels, gain, excess)
 
@@ -254,7 +268,10 @@ class Joint:
         self, fit: Fit, weight: NDArray[np.float32], total: NDArray[np.float32], population: Population
     ) -> NDArray[np.float64]:
         """Places of further particles, at full resolution; some may lie outside the frame."""
-        left = self.reduced(fit.residual * np.sqrt(weight / (1 + weight * total)))
+        amplitude = fit.places[fit.order, 3]
+        left = fit.residual.copy()
+        fit.columns.add_to(left, amplitude - population.typical(amplitude))
+        left = self.reduced(left * np.sqrt(weight / (1 + weight * total)))
         return self._new(left, population, fit.places.shape[1], whiten=False, outside_px=self.model.size / 4)
 
     def reduced(self, frame: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -295,7 +312,8 @@ class Joint:
     def _foreign(explained: Explained) -> NDArray[np.bool_]:
         """Which of a fit's particles no pattern explains: debris, dust."""
         amplitude, population = explained.fit.places[:, 3], explained.population
-        unusual = np.abs(np.log(amplitude / population.centre)) / max(population.sigma, LEAST_SIGMA)
+        unsure = explained.fit.amplitude_std / amplitude
+        unusual = np.abs(np.log(amplitude / population.centre)) / np.hypot(max(population.sigma, LEAST_SIGMA), unsure)
         chi2, sigmas = FOREIGN_UNUSUAL
         return (explained.excess > FOREIGN) | (explained.excess > chi2) & (unusual > sigmas)
 
@@ -388,15 +406,16 @@ class _Search:
             if plain:
                 unexplained = self._frame - self._image
                 if self.surface is None:
-                    self.surface = suitable(joint._small_backgrounds, unexplained, self._weight, joint.model.size / 16)
+                    self.surface = suitable(joint._small_backgrounds, unexplained, self._weight, joint._blur, FINER)
                 self._background = joint._small_backgrounds[self.surface].fit(unexplained, self._weight)
             total = joint._small.error_variance(self.places, self._frame.shape)
             left = (self._frame - self._image - self._background) / np.sqrt(1 + self._scale**2 * total)
             new = joint._new(left, self.population, whiten=True) / (self._scale, self._scale, 1, 1)
             if not len(new):
                 break
+            before = len(self.places)
             self._add(level, new, least, self._frame - self._background if plain else self._sharp_frame)
-            if len(new) < 0.05 * len(self.places):
+            if len(self.places) - before < FEW * len(self.places):
                 break
 
     def _add(self, level: Level, new: NDArray[np.float64], least: float, frame: NDArray[np.float32]) -> None:
@@ -409,7 +428,13 @@ class _Search:
         self._fit, self._stays, self._total = fit, stays, total
         self.places = fit.places[stays]
         self.population = learned_population(fit, stays, population)
-        self._image = self._joint._small.renderer.image(self.places, frame.shape)
+        self._image = self._typical_image()
+
+    def _typical_image(self) -> NDArray[np.float32]:
+        """Model image, its amplitudes typical: what is too bright for one particle may be two."""
+        places = self.places.copy()
+        places[:, 3] = self.population.typical(places[:, 3])
+        return self._joint._small.renderer.image(places, self._frame.shape)
 
     def odd(self) -> NDArray[np.bool_]:
         """Which particles have a residual that is more than noise."""
@@ -423,7 +448,7 @@ class _Search:
         self.places = self.places[~which]
         self._stays = self._stays.copy()
         self._stays[np.flatnonzero(self._stays)[which]] = False
-        self._image = self._joint._small.renderer.image(self.places, self._frame.shape)
+        self._image = self._typical_image()
 
 
 def _even(patterns: NDArray) -> int:

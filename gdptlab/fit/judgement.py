@@ -25,6 +25,9 @@ particle is odd: it, or one that is not found yet, lies elsewhere."""
 WORST = 0.5
 """Fraction of the largest chi-square within half a template below which a particle is but a neighbour of an odd one."""
 
+NEAR = 1 / 12
+"""Distance, as a fraction of a template and of the stack, within which two particles may stand for one."""
+
 NARROWEST = 0.02
 """Least standard deviation of the logarithm of amplitudes that is believed."""
 
@@ -89,6 +92,26 @@ class Level:
         distance = np.hypot(*(places[:, None, :2] - places[:, :2]).T)
         worst = np.where(distance < self.size / 2, excess, 0).max(axis=1)
         return (excess > ODD) & (excess > WORST * worst)
+
+    def merged(self, places: NDArray[np.float64], excess: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Particles (P, 4 + K), those merged that stand for one: too near to converge, their residual more than noise.
+
+        If they are two, one will not do, and the other is found again in the residual.
+        """
+        places, gone = places.copy(), np.zeros(len(places), bool)
+        near = self.size * NEAR, self.renderer.count * NEAR
+        for i in np.argsort(places[:, 3], kind="stable"):
+            distance, apart = np.hypot(*(places[:, :2] - places[i, :2]).T), np.abs(places[:, 2] - places[i, 2])
+            partner = (distance < near[0]) & (apart < near[1]) & ~gone
+            partner[i] = False
+            if excess[i] < ODD or not partner.any():
+                continue
+            j = np.flatnonzero(partner)[distance[partner].argmin()]
+            amplitude = places[[i, j], 3]
+            places[j] = amplitude @ places[[i, j]] / amplitude.sum()
+            places[j, 3] = amplitude.sum()
+            gone[i] = True
+        return places[~gone]
 
     def _slices(self, places: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
         """Slices of the patterns (P,) at places in the field."""

@@ -28,6 +28,9 @@ UNSURE = 1.5
 LEVELS = 14
 """Number of amplitudes, each twice the one before, for which the support is tabulated."""
 
+ROOM_PX = 2
+"""Pixels by which a particle's place in memory is larger, on each side, than its support, which changes as it moves."""
+
 RIM = 4
 """Nodes of the spline around the patterns, for its four-point support about a particle between two pixels."""
 
@@ -41,7 +44,7 @@ class Columns:
     boxes : int array (P, 4)
         First row, end of the rows, first column and end of the columns of each particle, cut at the frame.
     starts : int array (P + 1,)
-        Where its pixels, row by row, begin in `values`.
+        Where its pixels, row by row, begin in `values`; there may be room for more of them than the support has.
     values : float32 array (4 or 4 + K, pixels)
         Derivatives by y, x, slice and amplitude, then by each mode; [3] is the image at amplitude 1.
     threads : int
@@ -51,6 +54,11 @@ class Columns:
     starts: NDArray[np.int64]
     values: NDArray[np.float32]
     threads: int = 1
+
+    @property
+    def area(self) -> NDArray[np.int64]:
+        """Pixels of each particle's support in the frame, (P,)."""
+        return _area(self.boxes)
 
     def add_to(self, frame: NDArray[np.float32], amplitude: NDArray[np.float64]) -> None:
         """Add all images, each times its `amplitude` (P,), to `frame`."""
@@ -82,7 +90,7 @@ class Columns:
         def kernel(first: int, end: int) -> None:
             _gradient(residual, weight, first, end, self.boxes, self.starts, self.values, sums)
 
-        in_parts(self.threads, np.diff(self.starts), kernel)
+        in_parts(self.threads, self.area, kernel)
         return sums[:, :4], sums[:, 4]
 
     def matrix(self, weight: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -90,17 +98,28 @@ class Columns:
 
         The better the particles are sorted by x, the narrower it is.
         """
+        band = np.zeros((4 * self._widest() + 4, 4 * len(self.boxes)))
+        self.renew(band, weight, np.ones(len(self.boxes), bool))
+        return band
+
+    def renew(self, band: NDArray[np.float64], weight: NDArray[np.float32], moved: NDArray[np.bool_]) -> bool:
+        """Compute anew what a `matrix` has of the particles that `moved` (P,); False if it is too narrow."""
+        if 4 * self._widest() + 4 > len(band):
+            return False
+
+        def kernel(first: int, end: int) -> None:
+            _matrix(weight, first, end, moved, self.boxes, self.starts, self.values, band)
+
+        in_parts(self.threads, self.area, kernel)
+        return True
+
+    def _widest(self) -> int:
+        """Largest distance, in their order, of two particles that can overlap."""
         count = len(self.boxes)
         # The last particle that can overlap with particle i; boxes are sorted by x only roughly.
         nearest_start = np.minimum.accumulate(self.boxes[::-1, 2])[::-1]
         last = np.searchsorted(nearest_start, self.boxes[:, 3]) - 1 - np.arange(count)
-        band = np.zeros((4 * max(int(last.max(initial=0)), 0) + 4, 4 * count))
-
-        def kernel(first: int, end: int) -> None:
-            _matrix(weight, first, end, self.boxes, self.starts, self.values, band)
-
-        in_parts(self.threads, np.diff(self.starts), kernel)
-        return band
+        return max(int(last.max(initial=0)), 0)
 
 
 class Renderer:
@@ -159,6 +178,7 @@ class Renderer:
         heights: NDArray[np.float64] | None = None,
         *,
         by_mode: bool = False,
+        room_px: int = 0,
     ) -> Columns:
         """Draw particles, with derivatives.
 
@@ -172,14 +192,41 @@ class Renderer:
             Slices at which the particles are in focus, if not those of the focal surface.
         by_mode : bool
             Append to the columns the derivative by each mode.
+        room_px : int
+            Room that is left for particles to be drawn again elsewhere (`redraw`), px.
         """
         terms = field_terms(places[:, 1], places[:, 0], shape)
-        slices = places[:, 2] - (terms @ self.surface if heights is None else heights)
-        slices = np.clip(slices, -1.0, float(self.count))
+        slices = self._slices(places, terms, heights)
         boxes = self.boxes(places, slices, shape)
-        area = np.maximum(boxes[:, 1] - boxes[:, 0], 0) * np.maximum(boxes[:, 3] - boxes[:, 2], 0)
-        starts = np.concatenate([[0], np.cumsum(area)])
+        capacity = _area(boxes + room_px * np.array([-1, 1, -1, 1])) * (_area(boxes) > 0)
+        starts = np.concatenate([[0], np.cumsum(capacity)])
         values = np.empty((4 + by_mode * self.modes, starts[-1]), dtype=np.float32)
+        columns = Columns(boxes, starts, values, self.threads)
+        self._fill(columns, places, slices, terms, np.arange(len(places)))
+        return columns
+
+    def redraw(
+        self, columns: Columns, places: NDArray[np.float64], shape: tuple[int, int], moved: NDArray[np.bool_]
+    ) -> bool:
+        """Draw again, in their place, the particles that `moved` (P,); False if the room does not do."""
+        which = np.flatnonzero(moved)
+        terms = field_terms(places[:, 1], places[:, 0], shape)
+        slices = self._slices(places, terms, None)
+        boxes = self.boxes(places[which], slices[which], shape)
+        if (_area(boxes) > np.diff(columns.starts)[which]).any():
+            return False
+        columns.boxes[which] = boxes
+        self._fill(columns, places, slices, terms, which)
+        return True
+
+    def _slices(self, places: NDArray, terms: NDArray, heights: NDArray | None) -> NDArray[np.float64]:
+        """Slices of the patterns (P,) of particles in focus at `heights`, or on the focal surface."""
+        return np.clip(places[:, 2] - (terms @ self.surface if heights is None else heights), -1.0, float(self.count))
+
+    def _fill(
+        self, columns: Columns, places: NDArray, slices: NDArray, terms: NDArray, which: NDArray[np.int64]
+    ) -> None:
+        """Fill the columns of the particles `which`."""
         factors = np.zeros((len(places), len(self._nodes)), np.float32)
         factors[:, : self.terms] = terms[:, : self.terms]
         factors[:, self.terms : self.terms + places.shape[1] - 4] = places[:, 4 : 4 + self.modes]
@@ -188,18 +235,22 @@ class Renderer:
         def kernel(first: int, end: int) -> None:
             scratch = np.zeros((5, self.fine, self.fine, (size + RIM) * (size + RIM)), np.float32)
             _draw(
-                self._nodes, factors, self.terms, self._differ, places, slices, first, end,
-                boxes, starts, values, scratch,
+                self._nodes, factors, self.terms, self._differ, places, slices, which[first:end],
+                columns.boxes, columns.starts, columns.values, scratch,
             )  # fmt: skip
 
-        in_parts(self.threads, area, kernel)
-        return Columns(boxes, starts, values, self.threads)
+        in_parts(self.threads, columns.area[which], kernel)
 
     def image(self, places: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
         """Model image (rows, columns) of all particles at `places` (P, 4 + K)."""
         frame = np.zeros(shape, np.float32)
         self.draw(places, shape).add_to(frame, places[:, 3])
         return frame
+
+
+def _area(boxes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pixels of boxes (P, 4): first row, end of the rows, first column, end of the columns."""
+    return np.maximum(boxes[:, 1] - boxes[:, 0], 0) * np.maximum(boxes[:, 3] - boxes[:, 2], 0)
 
 
 def _nodes(patterns: NDArray, fine: int) -> NDArray[np.float32]:
@@ -256,10 +307,8 @@ def _spline(f):  # pragma: no cover
 
 
 @compiled
-def _draw(
-    nodes, factors, terms, differ, places, slices, first, end, boxes, starts, values, scratch
-):  # pragma: no cover
-    """Fill `values` of particles `first` to `end`: along z over the nodes of the support, then x, then y.
+def _draw(nodes, factors, terms, differ, places, slices, which, boxes, starts, values, scratch):  # pragma: no cover
+    """Fill `values` of the particles `which`: along z over the nodes of the support, then x, then y.
 
     Nodes are handled by phase, and those of one phase of rows and columns as one long line, a row after the other.
     `scratch` (5, fine, fine, nodes) holds such lines: image, derivative by z, then the same and the derivative by x
@@ -267,7 +316,7 @@ def _draw(
     """
     _, levels, _, fine, width = nodes.shape
     middle = nodes.shape[2] // 2
-    for i in range(first, end):
+    for i in which:
         y0, y1, x0, x1 = boxes[i]
         rows, columns = y1 - y0, x1 - x0
         if rows <= 0 or columns <= 0:
@@ -300,7 +349,7 @@ def _draw(
         _along_y(scratch[2], v, np.float32(1), rows, columns, across, scratch[0, 0, 0], values[3, s:])
         for m in range(4, len(values)):
             if used == terms:
-                values[m, s : starts[i + 1]] = 0
+                values[m, s : s + rows * columns] = 0
                 continue
             for j in range(fine * (rows - 1) + 4):
                 for p in range(fine):
@@ -393,48 +442,47 @@ def _gradient(residual, weight, first, end, boxes, starts, values, sums):  # pra
 
 
 @compiled
-def _matrix(weight, begin, end, boxes, starts, values, band):  # pragma: no cover
+def _matrix(weight, begin, end, moved, boxes, starts, values, band):  # pragma: no cover
+    """Fill the columns `begin` to `end` of the band, where one of the two particles `moved`."""
     j0, j1, j2, j3 = values[0], values[1], values[2], values[3]
-    largest = 0
-    for i in range(begin, end):
-        largest = max(largest, starts[i + 1] - starts[i])
-    trusted = np.empty(largest, np.float32)
     zero = np.float32(0)
     for i in range(begin, end):
         y0, y1, x0, x1 = boxes[i]
-        first, area, columns = starts[i], starts[i + 1] - starts[i], x1 - x0
-        if area <= 0:
-            continue
-        for r in range(y0, y1):
-            row, there = weight[r, x0:x1], trusted[(r - y0) * columns :]
-            for q in range(columns):
-                there[q] = row[q]
-        a0, a1, a2, a3 = j0[first:], j1[first:], j2[first:], j3[first:]
-        m00 = m01 = m02 = m03 = m11 = m12 = m13 = m22 = m23 = m33 = zero
-        for q in range(area):
-            w = trusted[q]
-            u0, u1, u2, u3 = a0[q], a1[q], a2[q], a3[q]
-            m00 += w * u0 * u0
-            m01 += w * u0 * u1
-            m02 += w * u0 * u2
-            m03 += w * u0 * u3
-            m11 += w * u1 * u1
-            m12 += w * u1 * u2
-            m13 += w * u1 * u3
-            m22 += w * u2 * u2
-            m23 += w * u2 * u3
-            m33 += w * u3 * u3
-        c = 4 * i
-        band[0, c], band[1, c], band[2, c], band[3, c] = m00, m01, m02, m03
-        band[0, c + 1], band[1, c + 1], band[2, c + 1] = m11, m12, m13
-        band[0, c + 2], band[1, c + 2], band[0, c + 3] = m22, m23, m33
+        columns, c = x1 - x0, 4 * i
+        if moved[i]:
+            m00 = m01 = m02 = m03 = m11 = m12 = m13 = m22 = m23 = m33 = zero
+            for r in range(y0, y1):
+                s = starts[i] + (r - y0) * columns
+                row = weight[r, x0:x1]
+                a0, a1, a2, a3 = j0[s:], j1[s:], j2[s:], j3[s:]
+                for q in range(len(row)):
+                    w = row[q]
+                    u0, u1, u2, u3 = a0[q], a1[q], a2[q], a3[q]
+                    m00 += w * u0 * u0
+                    m01 += w * u0 * u1
+                    m02 += w * u0 * u2
+                    m03 += w * u0 * u3
+                    m11 += w * u1 * u1
+                    m12 += w * u1 * u2
+                    m13 += w * u1 * u3
+                    m22 += w * u2 * u2
+                    m23 += w * u2 * u3
+                    m33 += w * u3 * u3
+            band[0, c], band[1, c], band[2, c], band[3, c] = m00, m01, m02, m03
+            band[0, c + 1], band[1, c + 1], band[2, c + 1] = m11, m12, m13
+            band[0, c + 2], band[1, c + 2], band[0, c + 3] = m22, m23, m33
         for j in range(i + 1, len(boxes)):
             d = 4 * (j - i)
             if d + 3 >= len(band):
                 break
+            if not (moved[i] or moved[j]):
+                continue
             top, bottom = max(y0, boxes[j, 0]), min(y1, boxes[j, 1])
             left, right = max(x0, boxes[j, 2]), min(x1, boxes[j, 3])
             if top >= bottom or left >= right:
+                if band[d, c] != 0:
+                    for k in range(4):
+                        band[d - k : d - k + 4, c + k] = 0
                 continue
             others = boxes[j, 3] - boxes[j, 2]
             s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = zero

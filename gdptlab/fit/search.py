@@ -9,11 +9,10 @@ are explained, all of an image does.
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from gdptlab._compiled import compiled
 from gdptlab.correlation import good_shape, times_conjugate
-from gdptlab.fit.solver import Population
+from gdptlab.fit.solver import LEAST_SPREAD, Population
 
 DEPTHS = 13
 """About as many depths are searched; the fit finds those between."""
@@ -30,9 +29,6 @@ in ten million, and a frame has some ten thousand places to be at."""
 
 WIDE = 0.5
 """Standard deviation of the logarithm of amplitudes from which on the search takes them for free."""
-
-LEAST_SPREAD = 0.05
-"""Least relative standard deviation of amplitudes in the search, which looks at whole pixels and few depths."""
 
 SHARE = 0.1
 """Fraction of the gain of a lone particle that a further one must bring, where amplitudes are known."""
@@ -226,8 +222,10 @@ def smooth_power(spectrum: NDArray[np.float32], sigma: float) -> NDArray[np.floa
     """Power of a spectrum, (rows, columns / 2 + 1), smoothed over `sigma` frequency steps."""
     squares = spectrum**2
     inner = squares[:, 1:-1:2] + squares[:, 2:-1:2]
-    # The outermost columns are packed in another way; their neighbours stand in for them.
-    return gaussian_filter(np.pad(inner, ((0, 0), (1, 1)), mode="edge"), sigma, mode=("wrap", "nearest"))
+    rim = int(np.ceil(3 * sigma))  # rows go around; the outermost columns are packed in another way, and left out
+    inner = cv2.copyMakeBorder(inner, rim, rim, 0, 0, cv2.BORDER_WRAP)
+    inner = cv2.copyMakeBorder(inner, 0, 0, 1, 1, cv2.BORDER_REPLICATE)
+    return cv2.GaussianBlur(inner, (2 * rim + 1, 2 * rim + 1), sigma, borderType=cv2.BORDER_REPLICATE)[rim:-rim]
 
 
 def packed(half: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -14,19 +14,26 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from gdptlab._compiled import compiled
 from gdptlab.fit.background import Background
-from gdptlab.fit.renderer import Columns, Renderer
+from gdptlab.fit.renderer import ROOM_PX, Columns, Renderer
 
 LONGEST_STEP = np.array([1.5, 1.5, 1.5, 0.7])
 """Longest Gauss-Newton step of y, x (px), slice, and amplitude (as a fraction of it)."""
 
-CONVERGED = 0.02
-"""Fraction of the longest step below which a step is the last."""
+CONVERGED = 0.1
+"""Step, in standard deviations of a particle whose neighbours are known, below which the particle stays where it is."""
 
-LONG = 0.2
-"""Fraction of the longest step from which on a step changes the matrix enough for it to be made again."""
+FAR, MANY = 0.2, 0.05
+"""The matrix is made again when more than the fraction MANY of the particles are farther than the fraction FAR of the
+longest step from where they were when it was made. A step that is cut short for as few is as good as a whole one."""
 
-DAMPING = 1e-3
+DAMPING = 1e-5
 """Fraction by which the diagonal is raised (Levenberg)."""
+
+LEAST_SPREAD = 0.05
+"""Least relative standard deviation of amplitudes while particles are sought."""
+
+TYPICAL = 3.5
+"""Standard deviations of the logarithm within which an amplitude is typical."""
 
 FAINTEST = 0.005
 """Least amplitude, as a fraction of the population's median."""
@@ -55,6 +62,11 @@ class Population:
         """One over the variance that the prior leaves to the amplitude, near it."""
         return (self.sigma * amplitude) ** -2
 
+    def typical(self, amplitude: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The amplitudes, brought to within `TYPICAL` standard deviations of the centre."""
+        factor = np.exp(TYPICAL * max(self.sigma, LEAST_SPREAD))
+        return np.clip(amplitude, self.centre / factor, self.centre * factor)
+
     def penalty(self, amplitude: NDArray[np.float64]) -> NDArray[np.float64]:
         """Minus the logarithm of the prior, 0 at its centre."""
         return np.log(amplitude / self.centre) ** 2 / (2 * self.sigma**2)
@@ -82,7 +94,6 @@ class Fit:
     _order: NDArray[np.int64]
     _columns: Columns
     _system: "_System"
-    _gradient: NDArray[np.float64]
     _chi2: NDArray[np.float64]
 
     @property
@@ -93,7 +104,7 @@ class Fit:
     @property
     def area(self) -> NDArray[np.int64]:
         """Pixels of each particle's support in the frame, 1 or more, (P,)."""
-        return self._in_order(np.maximum(np.diff(self._columns.starts), 1))
+        return self._in_order(np.maximum(self._columns.area, 1))
 
     def chi2_of(self, residual: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
         """The same as `chi2`, of another residual and weight."""
@@ -183,76 +194,112 @@ def fitted(
     background : float32 array (rows, columns), optional
         Background to begin with; without it, the one that fits what the particles leave.
     """
-    places, system, residual = places.copy(), None, np.empty_like(frame)
+    order = np.argsort(places[:, 1], kind="stable")
+    sorted_places, residual = places[order], np.empty_like(frame)
     if surface is None:
         background = np.float32(0)
-    step = -1
-    while step < steps:
-        step += 1
-        if system is None:
-            order = np.argsort(places[:, 1], kind="stable")
-        columns = renderer.draw(places[order], frame.shape)
+    columns = renderer.draw(sorted_places, frame.shape, room_px=ROOM_PX)
+    system = _System(columns, sorted_places, weight, surface)
+    for step in range(steps + 1):
         image = np.zeros_like(frame)
-        columns.add_to(image, places[order, 3])
+        columns.add_to(image, sorted_places[:, 3])
         if background is None:
             background = surface.fit(frame - image, weight)
         residual = np.subtract(frame, image, out=residual)
         residual -= background
-        if system is None:
-            system = _System(columns, weight, population.precision(places[order, 3]), surface)
         gradient, chi2 = columns.gradient(residual, weight)
         if step == steps:
             break
+        system.factorise(columns, sorted_places, population, MANY)
         right = gradient.copy()
-        right[:, 3] += population.pull(places[order, 3])
+        right[:, 3] += population.pull(sorted_places[:, 3])
         change, shift = system.solve(right.ravel(), surface.gradient(residual, weight) if surface else None)
         change = change.reshape(-1, 4)
-        fraction = np.abs(change) / (LONGEST_STEP * _scale(places[order]))
-        if surface is not None and fraction.max(initial=0) <= 1:  # it belongs to the whole step, not to one cut short
+        fraction = (np.abs(change) / _longest(sorted_places)).max(axis=1, initial=0)
+        moved = (np.abs(change) * np.sqrt(system.diagonal)).max(axis=1, initial=0) > CONVERGED
+        # The background's step belongs to whole steps of the particles, but for a few.
+        if surface is not None and (fraction > 1).sum() <= MANY * len(fraction):
             background = background + surface.surface(shift)
-        places[order, :4] += change / np.maximum(fraction.max(axis=1, keepdims=True), 1)
-        places[:, 2] = np.clip(places[:, 2], 0, renderer.count - 1)
-        places[:, 3] = np.maximum(places[:, 3], FAINTEST * population.centre)
-        longest = fraction.max(initial=0)
-        if longest > LONG:
-            system = None
-        if longest < CONVERGED:
-            steps = step + 1
-    return Fit(places, frame, residual, image, background, population, order, columns, system, gradient, chi2)
+            residual = frame - image - background
+        if not moved.any():
+            break
+        sorted_places[moved, :4] += (change / np.maximum(fraction, 1)[:, None])[moved]
+        sorted_places[:, 2] = np.clip(sorted_places[:, 2], 0, renderer.count - 1)
+        sorted_places[:, 3] = np.maximum(sorted_places[:, 3], FAINTEST * population.centre)
+        if not renderer.redraw(columns, sorted_places, frame.shape, moved):
+            columns = renderer.draw(sorted_places, frame.shape, room_px=ROOM_PX)
+    system.factorise(columns, sorted_places, population, 0)
+    places = places.copy()
+    places[order] = sorted_places
+    return Fit(places, frame, residual, image, background, population, order, columns, system, chi2)
 
 
-def _scale(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the longest steps (P, 4) are fractions of."""
-    scale = np.ones((len(places), 4))
-    scale[:, 3] = places[:, 3]
-    return scale
+def _longest(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Longest steps (P, 4)."""
+    longest = np.tile(LONGEST_STEP, (len(places), 1))
+    longest[:, 3] *= places[:, 3]
+    return longest
 
 
 class _System:
-    """The matrix, factorised: a band for the particles, bordered by the background."""
+    """The matrix, factorised: a band for the particles, bordered by the background.
+
+    Parameters
+    ----------
+    columns : Columns
+        Particles at `places`, sorted by x.
+    weight : float32 array (rows, columns)
+    surface : Background, optional
+    """
 
     def __init__(
-        self,
-        columns: Columns,
-        weight: NDArray[np.float32],
-        precision: NDArray[np.float64],
-        surface: Background | None,
+        self, columns: Columns, places: NDArray[np.float64], weight: NDArray[np.float32], surface: Background | None
     ) -> None:
-        band = columns.matrix(weight)
-        self.alone = band[0, 3::4].copy()
-        band[0, 3::4] += precision
+        self._weight, self._surface = weight, surface
+        self._places, self._band, self._factor = places.copy(), columns.matrix(weight), None
+        self._mixed = None
+        if surface is not None:
+            self._plain_border = surface.matrix(weight)
+            self._plain_border[np.diag_indices_from(self._plain_border)] *= 1 + DAMPING
+            self._border = self._plain_border
+        if surface is not None and len(places):
+            self._mixed = surface.products(columns, weight)
+
+    @property
+    def alone(self) -> NDArray[np.float64]:
+        """Weighted squares of each particle's pattern, (P,)."""
+        return self._band[0, 3::4]
+
+    @property
+    def diagonal(self) -> NDArray[np.float64]:
+        """Weighted squares of the columns: one over the variance were all else known, (P, 4)."""
+        return self._band[0].reshape(-1, 4)
+
+    def factorise(self, columns: Columns, places: NDArray[np.float64], population: Population, many: float) -> None:
+        """Factorise the matrix with the prior of the amplitudes.
+
+        Where more than the fraction `many` of the particles are far from where they were, the matrix is made again,
+        for all that have moved: made for one of a pair alone, it might not be positive definite.
+        """
+        change = np.abs(places[:, :4] - self._places[:, :4])
+        far = (change > FAR * _longest(places)).any(axis=1).sum() > many * len(places)
+        if self._factor is not None and not far:
+            return
+        if far:
+            moved = change.any(axis=1)
+            self._places[moved] = places[moved]
+            if not columns.renew(self._band, self._weight, moved):
+                self._band = columns.matrix(self._weight)
+            if self._mixed is not None:
+                self._surface.renew(self._mixed, columns, self._weight, moved)
+        band = self._band.copy()
+        band[0, 3::4] += population.precision(places[:, 3])
         band[0, band[0] <= 0] = 1  # of particles without a pixel
         band[0] *= 1 + DAMPING
         self._factor = cholesky_banded(band, lower=True, check_finite=False) if band.size else band
-        self._mixed = None
-        if surface is not None:
-            self._border = surface.matrix(weight)
-            # The products are good to a few per cent: the background is damped by as much.
-            self._border[np.diag_indices_from(self._border)] *= 1.03
-        if surface is not None and band.size:
-            self._mixed = surface.products(columns, weight)
+        if self._mixed is not None:
             self._solved = self._without(self._mixed)
-            self._border -= self._mixed.T @ self._solved
+            self._border = self._plain_border - self._mixed.T @ self._solved
 
     def _without(self, right: NDArray) -> NDArray:
         """Solve as if there were no background."""
@@ -314,7 +361,7 @@ def _correlations(residual, amplitude, boxes, starts, values):  # pragma: no cov
     out = np.zeros(len(boxes))
     for i in range(len(boxes)):
         y0, y1, x0, x1 = boxes[i]
-        area, light = starts[i + 1] - starts[i], np.float32(amplitude[i])
+        area, light = (y1 - y0) * (x1 - x0), np.float32(amplitude[i])
         if area <= 0:
             continue
         s = t = ss = tt = st = 0.0
