@@ -1,6 +1,7 @@
-"""Microscope, calibrations and frames that many tests fraction; each is made once."""
+"""Microscope, calibrations and frames that many tests share; each is made once."""
 
 import os
+import sys
 from functools import partial
 
 import numpy as np
@@ -41,6 +42,14 @@ def on_grid(rng: np.random.Generator, shape=(512, 700), pitch_px: float = 75, ji
     x, y = np.meshgrid(*(np.arange(margin, n - margin, pitch_px) for n in (columns, rows)))
     jitter = rng.uniform(-jitter_px, jitter_px, (2, x.size))
     return table(x.ravel() + jitter[0], y.ravel() + jitter[1], rng.uniform(-50, 50, x.size))
+
+
+@pytest.fixture(autouse=True)
+def own_style():
+    """The style of pictures that a test, or what it calls, sets ends with the test."""
+    yield
+    if "matplotlib" in sys.modules:
+        sys.modules["matplotlib"].rcdefaults()
 
 
 @pytest.fixture(scope="session")
