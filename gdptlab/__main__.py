@@ -16,6 +16,7 @@ from nbclient import NotebookClient
 from tqdm import tqdm
 
 from gdptlab._files import written_whole
+from gdptlab.preparation import BACKGROUNDS, Preparation
 
 ROOT = Path(__file__).resolve().parents[1]
 """Folder of the checkout."""
@@ -143,10 +144,32 @@ def measure_images(options: argparse.Namespace) -> int:
         um_per_px=options.um_per_px,
         frame_rate_hz=options.rate,
         search_range_um=options.search_range,
+        depth_factor=options.indices or options.depth_factor,
+        side=options.side,
+        prepare=_preparation(options),
         n_jobs=options.jobs,
         **{name: value for name, value in choices.items() if value is not None},
     )
     return _say(measured.folder, measured.quality)
+
+
+def _preparation(options: argparse.Namespace) -> Preparation | None:
+    """What is to be done to the frames, if anything is."""
+    from gdptlab.pipeline import mean_image
+
+    asked = {name: getattr(options, name) for name in ("dark", "flat", "mask", "background")}
+    if asked["background"] in BACKGROUNDS:
+        images, rest = ("dark", "flat", "mask"), {"background": asked["background"]}
+    else:
+        images, rest = ("dark", "flat", "mask", "background"), {}
+    rest |= {name: mean_image(asked[name]) for name in images if asked[name] is not None}
+    if options.region is not None:
+        rest["region"] = tuple(options.region)
+    if options.frame_range is not None:
+        rest["first"], rest["last"] = options.frame_range
+    if options.every != 1:
+        rest["every"] = options.every
+    return Preparation(**rest) if any(value is not None for value in rest.values()) else None
 
 
 def report_folder(options: argparse.Namespace) -> int:
@@ -214,6 +237,36 @@ def _parser() -> argparse.ArgumentParser:
         metavar=("X", "Y", "Z"),
         help="how far from where it is expected a particle is looked for in the next frame, µm",
     )
+    measures.add_argument(
+        "--depth-factor",
+        type=float,
+        metavar="F",
+        help="depth in the sample over travel of the stage, as measured, if the depths of the scan are travel",
+    )
+    measures.add_argument(
+        "--indices",
+        nargs=2,
+        type=float,
+        metavar=("IMMERSION", "SAMPLE"),
+        help="refractive indices from which that factor follows, such as 1 1.33 for a dry lens and water",
+    )
+    measures.add_argument(
+        "--side", help="near or far: only depths on this side of focus, smaller or larger, where both look alike"
+    )
+    prepares = measures.add_argument_group("what is done to the frames first")
+    prepares.add_argument("--dark", metavar="FILE", help="image without light; of several, the mean")
+    prepares.add_argument("--flat", metavar="FILE", help="image of even light, without particles; of several, the mean")
+    prepares.add_argument(
+        "--background",
+        metavar="median|minimum|FILE",
+        help="subtracted: median or minimum over the film, or an image; takes resting particles away, too",
+    )
+    prepares.add_argument("--mask", metavar="FILE", help="image that is not 0 where particles are measured")
+    prepares.add_argument("--region", nargs=4, type=int, metavar=("LEFT", "TOP", "RIGHT", "BOTTOM"), help="px, from 0")
+    prepares.add_argument(
+        "--frames", nargs=2, type=int, dest="frame_range", metavar=("FIRST", "LAST"), help="measured, from 0"
+    )
+    prepares.add_argument("--every", type=int, default=1, metavar="N", help="measure every N-th frame")
     measures.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; -1: one for each core")
     measures.add_argument("--method", help="correlation, or joint for overlapping particles; chosen if not given")
     measures.add_argument("--threshold", type=float, help="least correlation of a particle; chosen if not given")

@@ -20,6 +20,7 @@ frame's edge.
 
 from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import count, islice
 
 import cv2
@@ -33,6 +34,7 @@ from gdptlab._checks import choice, flag, image_array, positive, whole
 from gdptlab._compiled import on_one_core
 from gdptlab.calibration import Calibration, checked
 from gdptlab.correlation import peaks, standardised, strongest, vertex
+from gdptlab.preparation import Preparation, Prepared, preparation
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns by correlation, and their types."""
@@ -57,6 +59,7 @@ def locate(
     threshold: float | None = None,
     refine: bool = True,
     min_distance_px: float | None = None,
+    side: str | None = None,
 ) -> pd.DataFrame:
     """Measure x, y and z of every particle in a frame.
 
@@ -75,6 +78,9 @@ def locate(
         Walk along the whole stack to the best C_m. Without refinement, z comes from the subset's profile alone.
     min_distance_px : float, optional
         Smallest distance of two particles; a quarter of a template if not given.
+    side : str, optional
+        "near" or "far": only depths on this side of focus, smaller or larger, for optics whose images look alike on
+        both (`Calibration.one_side`).
 
     Returns
     -------
@@ -102,6 +108,8 @@ def locate(
     >>> list(table)
     ['x_px', 'y_px', 'z_um', 'cm', 'at_end']
     """
+    if side is not None:
+        calibration = checked(calibration).one_side(side)
     if choice("method", method, METHODS) == "joint":
         if threshold is not None or not flag("refine", refine) or min_distance_px is not None:
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
@@ -197,6 +205,7 @@ def batch(
     *,
     n_jobs: int = 1,
     progress: bool = True,
+    prepare: Preparation | None = None,
     **settings: object,
 ) -> pd.DataFrame:
     """Measure every particle in every frame.
@@ -214,6 +223,9 @@ def batch(
         the blocks go to all workers of the dask cluster instead. With method "joint" it is 1.
     progress : bool
         Show a progress bar.
+    prepare : Preparation, optional
+        Dark and flat image, background, mask, region, frames. The table is in the pixels and by the frames of the film.
+        Without a dark and a flat image, frames are corrected as the calibration's scan was (`Calibration.camera`).
     **settings
         Of `locate`. With method "joint" the frames should follow each other: each begins with the particles
         of the last, which keeps them apart where they meet later, and one that appears is in the table from
@@ -238,13 +250,34 @@ def batch(
         iter(frames)
     except TypeError as error:
         raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+    frames, prepare = prepared(frames, calibration, prepare)
     tables = [blank]
     total = len(frames) if hasattr(frames, "__len__") else None
     with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
         for _, n, table in in_blocks(frames, calibration, n_jobs, settings):
             tables.append(table)
             bar.update(n)
-    return pd.concat(tables, ignore_index=True)[[*blank]]
+    table = pd.concat(tables, ignore_index=True)[[*blank]]
+    return table if prepare is None else prepare.restored(table)
+
+
+def prepared(
+    frames: Iterable[ArrayLike], calibration: Calibration, prepare: Preparation | None
+) -> tuple[Iterable[ArrayLike], Preparation | None]:
+    """Frames as they are to be measured, and the preparation by which their table is to be restored, if there is one.
+
+    Frames that are prepared already stay as they are.
+    """
+    if prepare is None and not isinstance(frames, Prepared):
+        prepare = calibration.camera
+    if prepare is None:
+        return frames, None
+    if isinstance(frames, Prepared):
+        raise ValueError("prepare: got one for frames that are prepared already, allowed are frames as they come")
+    prepare, camera = preparation(prepare), calibration.camera
+    if prepare.camera is None and camera is not None:
+        prepare = replace(prepare, dark=camera.dark, flat=camera.flat)
+    return prepare(frames), prepare
 
 
 def blank_table(calibration: Calibration, n_jobs: int, settings: dict[str, object]) -> pd.DataFrame:
@@ -273,6 +306,8 @@ def in_blocks(
     Blocks whose first frame is in `done` are left out. A film by the joint fit is one chain, so that what comes
     before a missing block is measured once more; otherwise blocks know nothing of each other.
     """
+    if settings.get("side") is not None:
+        calibration, settings = calibration.one_side(settings["side"]), settings | {"side": None}
     if settings.get("method") == "joint":
         from gdptlab.fit.frames import explained
 

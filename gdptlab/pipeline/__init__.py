@@ -6,8 +6,9 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "images": ["Images", "open_images", "open_scan"],
+        "images": ["Images", "mean_image", "open_images", "open_scan"],
         "beads": ["ScanReport", "find_beads"],
+        "errors": ["with_errors"],
         "quality": ["depth_quality", "report"],
         "settings": ["Settings", "choose_settings"],
         "measuring": ["Measured", "measure"],

@@ -215,6 +215,26 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
     return Images(files, np.array(locations, dtype=np.int64), frame, um_per_px)
 
 
+def mean_image(path: str | os.PathLike[str]) -> NDArray[np.float32]:
+    """Mean (rows, columns) of all images in a file or a folder, such as those of a dark or a flat exposure.
+
+    Parameters
+    ----------
+    path
+        As for `open_images`.
+
+    Raises
+    ------
+    TypeError, FileNotFoundError, ValueError
+        As `open_images`.
+    """
+    images = open_images(path)
+    total = np.zeros(images.shape[1:])
+    for image in images:
+        total += image
+    return (total / len(images)).astype(np.float32)
+
+
 def open_scan(
     path: str | os.PathLike[str],
     *,

@@ -13,14 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from gdptlab._checks import positive
-from gdptlab._files import written_whole
+from gdptlab._files import keep_arrays, kept_arrays, sources_folder, written_whole
 from gdptlab.calibration import Calibration
+from gdptlab.pipeline.beads import ScanReport
+from gdptlab.pipeline.errors import with_errors
 from gdptlab.pipeline.images import Images, open_images, open_scan
 from gdptlab.pipeline.page import write_page
 from gdptlab.pipeline.quality import report
 from gdptlab.pipeline.settings import Settings, choose_settings
 from gdptlab.pipeline.stream import batch_to_parquet
 from gdptlab.pipeline.tables import about, as_json, in_um, save_points, save_table
+from gdptlab.preparation import Preparation, Prepared, preparation
 
 OF_SCAN = ("beads_px", "size", "n_sub")
 """Choices that `Calibration.from_scan` takes."""
@@ -76,6 +79,9 @@ def measure(
     um_per_px: float | None = None,
     frame_rate_hz: float | None = None,
     search_range_um: tuple[float, float, float] | None = None,
+    depth_factor: float | tuple[float, float] | None = None,
+    side: str | None = None,
+    prepare: Preparation | None = None,
     n_jobs: int = 1,
     progress: bool = True,
     **choices: object,
@@ -101,6 +107,12 @@ def measure(
     search_range_um : (x, y, z), optional
         As for `tracking.link`. If not given, `NEIGHBOUR` of the distance between neighbours, and `DEPTH` of the range
         of depths.
+    depth_factor : float or (n_immersion, n_sample), optional
+        Depth in the sample over travel of the stage, as for `Calibration.with_depth_factor`, if `z_um` is travel.
+    side : str, optional
+        "near" or "far": only depths on this side of focus, as for `Calibration.one_side`.
+    prepare : Preparation, optional
+        What is done to the film's frames; its dark and flat image correct the scan, too.
     n_jobs, progress
         As for `batch`; with the joint fit one process is used.
     **choices
@@ -130,24 +142,83 @@ def measure(
     um_per_px = _um_per_px(um_per_px, film, scanned)
     folder = _folder(folder, frames)
     given = {"z_um": z_um, "um_per_px": um_per_px, "frame_rate_hz": frame_rate_hz, "search_range_um": search_range_um}
+    given |= {"depth_factor": depth_factor, "side": side}
+    if prepare is not None:
+        given["prepare"] = preparation(prepare).note()
+    frames_used = film if prepare is None else prepare(film)
     inputs = {name: _hashes(images) for name, images in (("scan", scanned), ("frames", film))}
     _claim(folder, json.loads(as_json({"inputs": inputs, "settings": given | choices})))
 
-    calibration = Calibration.from_scan(scanned, depths, **{k: v for k, v in choices.items() if k in OF_SCAN})
+    of_scan = {k: v for k, v in choices.items() if k in OF_SCAN}
+    calibration = _calibrated(scanned, depths, list(inputs["scan"].values()), of_scan, prepare)
+    if depth_factor is not None:
+        calibration = calibration.with_depth_factor(depth_factor)
+    if side is not None:
+        calibration = calibration.one_side(side)
     quality = report(calibration)
-    settings = choose_settings(film, calibration, **{k: v for k, v in choices.items() if k in OF_FRAMES})
+    settings = choose_settings(frames_used, calibration, **{k: v for k, v in choices.items() if k in OF_FRAMES})
     n_jobs = 1 if settings.arguments["method"] == "joint" else n_jobs
     parts = batch_to_parquet(
-        film, calibration, folder / "frames", n_jobs=n_jobs, progress=progress, **settings.arguments
+        film,
+        calibration,
+        folder / "frames",
+        n_jobs=n_jobs,
+        progress=progress,
+        prepare=prepare,
+        **settings.arguments,
     )
-    particles, tracks = in_um(pd.read_parquet(parts), um_per_px), None
+    particles, tracks = pd.read_parquet(parts), None
+    if settings.arguments["method"] == "correlation":
+        particles = with_errors(particles, calibration)
+    particles = in_um(particles, um_per_px)
     if frame_rate_hz is not None:
-        ranges = search_range_um or _search_range(particles, depths)
-        tracks = _tracked(particles, frame_rate_hz, ranges)
+        ranges = search_range_um or _search_range(particles, calibration.z_um)
+        tracks = _tracked(particles, frame_rate_hz, ranges, prepare or Preparation())
         given["search_range_um"] = tuple(ranges)
     measured = Measured(folder, calibration, quality, settings, particles, tracks)
-    _write(measured, film, um_per_px, frame_rate_hz, {"inputs": inputs, "arguments": given | choices})
+    _write(measured, frames_used, um_per_px, frame_rate_hz, {"inputs": inputs, "arguments": given | choices})
     return measured
+
+
+def _calibrated(
+    scan: Images, z_um: NDArray, hashes: list[str], choices: dict[str, object], prepare: Preparation | None
+) -> Calibration:
+    """Calibration from a scan (N, rows, columns); that of a scan with these hashes is made once and kept in the cache."""
+    note = {} if prepare is None or prepare.camera is None else prepare.camera.note()
+    said = json.dumps([sorted(hashes), z_um.tolist(), choices, note], sort_keys=True, default=np.ndarray.tolist)
+    folder = sources_folder("calibrations")
+    kept = folder and folder / f"{hashlib.sha256(said.encode()).hexdigest()[:32]}.npz"
+    arrays = kept_arrays(kept) if kept else None
+    if arrays is not None:
+        camera = None if prepare is None else prepare.camera
+        made = {name: arrays[name] for name in ("stack", "z_um", "subset", "templates")}
+        return Calibration(**made, report=_unpacked(arrays), camera=camera)
+    calibration = Calibration.from_scan(np.asarray(scan), z_um, prepare=prepare, **choices)
+    if kept:
+        made = {name: getattr(calibration, name) for name in ("stack", "z_um", "subset", "templates")}
+        keep_arrays(kept, made | _packed(calibration.report))
+    return calibration
+
+
+def _packed(scan: ScanReport) -> dict[str, NDArray]:
+    """Arrays, by name, that hold what `from_scan` says of its scan."""
+    arrays = {name: np.asarray(getattr(scan, name)) for name in ("drift_px", "clipped", "overview", "noise")}
+    tables = {"beads": scan.beads, "settings": scan.settings.reset_index()}
+    for name, table in tables.items():
+        for column in table:
+            values = table[column].to_numpy()
+            arrays[f"{name}.{column}"] = values if values.dtype.kind in "fi" else values.astype(str)
+    return arrays
+
+
+def _unpacked(arrays: dict[str, NDArray]) -> ScanReport:
+    """What `_packed` packed."""
+    beads, settings = (
+        pd.DataFrame({key.partition(".")[2]: arrays[key] for key in arrays if key.startswith(f"{name}.")})
+        for name in ("beads", "settings")
+    )
+    arrays = {name: arrays[name] for name in ("drift_px", "clipped", "overview")} | {"noise": float(arrays["noise"])}
+    return ScanReport(beads=beads, settings=settings.set_index("setting"), **arrays)
 
 
 def _opened_scan(scan: str | os.PathLike[str], z_um: tuple[float, float] | None) -> tuple[Images, NDArray[np.float64]]:
@@ -229,20 +300,25 @@ def _search_range(particles: pd.DataFrame, z_um: NDArray) -> tuple[float, float,
     return in_plane, in_plane, DEPTH * float(z_um[-1] - z_um[0])
 
 
-def _tracked(particles: pd.DataFrame, frame_rate_hz: float, search_range: ArrayLike) -> pd.DataFrame:
-    """Tracks with velocities."""
+def _tracked(
+    particles: pd.DataFrame, frame_rate_hz: float, search_range: ArrayLike, prepare: Preparation
+) -> pd.DataFrame:
+    """Tracks with velocities; where not every frame was measured, linked from one that was to the next."""
     from gdptlab.tracking import link, velocities
 
-    tracks = link(particles, search_range=search_range, predictor="nearest velocity")
-    return velocities(tracks, frame_rate_hz)
+    counted = particles.assign(frame=(particles["frame"] - prepare.first) // prepare.every)
+    tracks = link(counted, search_range=search_range, predictor="nearest velocity")
+    tracks = velocities(tracks, frame_rate_hz / prepare.every)
+    return tracks.assign(frame=prepare.first + prepare.every * tracks["frame"])
 
 
 def _write(
-    measured: Measured, film: Images, um_per_px: float, frame_rate_hz: float | None, call: dict[str, object]
+    measured: Measured, film: Images | Prepared, um_per_px: float, frame_rate_hz: float | None, call: dict[str, object]
 ) -> None:
     """Write the results into their folder: tables, what other programs open, the page and, at last, the log."""
     folder, calibration, settings = measured.folder, measured.calibration, measured.settings
     notes = settings.arguments | {"um_per_px": um_per_px}
+    notes |= {name: call["arguments"][name] for name in ("side", "prepare") if call["arguments"].get(name)}
     calibration.save(folder / "calibration.npz")
     save_table(measured.particles, folder / "particles.csv", calibration, **notes)
     save_points(measured.particles, folder / "points_napari.csv", "napari")
@@ -260,14 +336,16 @@ def _write(
         temporary.write_text(as_json(call | about(calibration, settings.arguments)), encoding="utf-8")
 
 
-def _page(measured: Measured, film: Images) -> dict[str, object]:
+def _page(measured: Measured, film: Images | Prepared) -> dict[str, object]:
     """Headings, and what stands under them, of the page of results."""
     from gdptlab import plots
 
     particles, tracks = measured.particles, measured.tracks
     bad = measured.bad
     verdict = f"Bad: {', '.join(bad)}. Read the advice before you believe what comes." if bad else "Nothing is bad."
-    found = particles.groupby("frame").size().reindex(range(len(film)), fill_value=0)
+    done = film.preparation if isinstance(film, Prepared) else Preparation()
+    numbers = range(done.first, done.first + done.every * len(film), done.every)
+    found = particles.groupby("frame").size().reindex(numbers, fill_value=0)
     text = f"{len(particles)} particles in {len(film)} frames, {found.min()} to {found.max()} in a frame."
     if tracks is not None:
         text += f" {tracks['particle'].nunique()} tracks, of {len(tracks)} of them."
@@ -279,6 +357,9 @@ def _page(measured: Measured, film: Images) -> dict[str, object]:
         "What was measured": text,
     }
     k = len(film) // 2
-    here = particles[particles["frame"] == k]
-    parts[f"Frame {k}"] = plots.measured_page(film[k], here, measured.settings, measured.calibration)
+    left, top = (0, 0) if done.region is None else done.region[:2]
+    here = particles[particles["frame"] == numbers[k]].assign(
+        x_px=lambda table: table["x_px"] - left, y_px=lambda table: table["y_px"] - top
+    )
+    parts[f"Frame {numbers[k]}"] = plots.measured_page(film[k], here, measured.settings, measured.calibration)
     return parts

@@ -107,7 +107,7 @@ def choose_settings(
     false_fraction : float
         Fraction of false finds that is put up with.
     looked_at : int
-        How many frames are looked at.
+        How many frames are looked at; for the method, which takes longest, the middle one of them.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def choose_settings(
         raise ValueError("frames: got none, needed is one or more")
     others = {name: value for name, value in given.items() if name != "threshold"}
     found, false = (_found([sign * frame for frame in looked], calibration, others) for sign in (1, -1))
-    side_lobes, alone = _side_lobes(calibration, noise_level(looked[0]), others)
+    side_lobes, alone = _side_lobes(calibration, noise_level(looked[len(looked) // 2]), others)
     reasons = {"refine": "the whole stack is walked", "min_distance_px": "a quarter of a template"}
     if threshold is None:
         finds = (table["cm"] for table in (found, false, side_lobes, alone))
@@ -140,7 +140,7 @@ def choose_settings(
     elif given:
         method, reasons["method"] = "correlation", "only it has the settings given"
     else:
-        method, reasons["method"] = _method(looked[0], calibration)
+        method, reasons["method"] = _method(looked[len(looked) // 2], calibration)
     arguments = {"method": method}
     if method == "correlation":
         arguments |= {"threshold": threshold, "refine": True, "min_distance_px": calibration.size / 4} | given

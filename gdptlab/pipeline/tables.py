@@ -65,8 +65,10 @@ def about(calibration: Calibration, settings: dict[str, object]) -> dict[str, ob
     settings = unsaid | settings
     if settings["method"] == "correlation" and settings["threshold"] is None:
         settings["threshold"] = THRESHOLD
-    return {
+    camera = {} if calibration.camera is None else {"camera": calibration.camera.note()}
+    return camera | {
         "calibration": fingerprint(calibration),
+        "depth_factor": calibration.depth_factor,
         "settings": settings,
         "sources": sources_digest(),
         "versions": versions(),
