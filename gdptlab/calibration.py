@@ -575,8 +575,8 @@ def _odd(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     n = stack.shape[1]
     spectrum = np.fft.rfft2(levelled(stack), s=(2 * n, 2 * n))
     turned = np.fft.irfft2((spectrum**2).sum(axis=0))
-    twice = np.unravel_index(turned.argmax(), turned.shape)  # 2 c, along rows and columns
-    down, right = (slice(1, None) if c >= n else slice(None, -1) for c in twice)
+    along = (turned.max(axis=1), turned.max(axis=0))  # 2 c, along rows and columns, is where these are largest
+    down, right = (slice(1, None) if p[n:].max() > p[: n - 1].max() else slice(None, -1) for p in along)
     return np.ascontiguousarray(stack[:, down, right])
 
 

@@ -97,7 +97,7 @@ class Preparation:
             object.__setattr__(self, name, image)
         if self.flat is not None and not self._gain_is_sound():
             raise ValueError(
-                f"flat: got pixels that have, less the dark image, under {DARKEST} of its mean light, allowed are others"
+                f"flat: got pixels that have, less the dark image, under {DARKEST} of its mean light, allowed are more"
             )
         if self.region is not None:
             object.__setattr__(self, "region", _region(self.region))
@@ -177,9 +177,7 @@ class Preparation:
         if self.mask is None:
             return table
         rows, columns = self.mask.shape
-        at = [
-            np.clip(np.rint(table[name]).astype(int), 0, n - 1) for name, n in (("y_px", rows), ("x_px", columns))
-        ]
+        at = [np.clip(np.rint(table[name]).astype(int), 0, n - 1) for name, n in (("y_px", rows), ("x_px", columns))]
         return table[self.mask[at[0], at[1]]].reset_index(drop=True)
 
 
@@ -215,12 +213,16 @@ class Prepared(Sequence):
         last = len(frames) if preparation.last is None else min(preparation.last + 1, len(frames))
         number = range(preparation.first, last, preparation.every)
         if not len(number):
-            raise ValueError(f"frames: got {len(frames)}, none from frame {preparation.first} on, allowed is one or more")
+            raise ValueError(
+                f"frames: got {len(frames)}, none from frame {preparation.first} on, allowed is one or more"
+            )
         sample = real_array("frames", frames[number[0]], 2)
         self._whole = sample.shape
         image = next((i for i in _images(preparation)), None)
         if image is not None and image.shape != sample.shape:
-            raise ValueError(f"frames: got some of {sample.shape} px, allowed is the shape of the images, {image.shape}")
+            raise ValueError(
+                f"frames: got some of {sample.shape} px, allowed is the shape of the images, {image.shape}"
+            )
         region = preparation.region or (0, 0, *sample.shape[::-1])
         _must_hold(sample.shape, region)
         self.preparation, self._frames, self._number = preparation, frames, number

@@ -103,7 +103,7 @@ def test_a_film_is_read_when_it_is_asked_for(film, tmp_path, lamp) -> None:
     table = batch(open_images(tmp_path / "film.tif"), CALIBRATION, prepare=prepare, progress=False)
     folder = batch_to_parquet(tmp_path / "film.tif", CALIBRATION, tmp_path / "t", prepare=prepare, progress=False)
     pd.testing.assert_frame_equal(pd.read_parquet(folder), table)
-    with pytest.raises(ValueError, match="^folder: .*prepared"):
+    with pytest.raises(ValueError, match=r"^folder: .*prepared"):
         other = Preparation(dark=prepare.dark, flat=prepare.flat, every=4)
         batch_to_parquet(tmp_path / "film.tif", CALIBRATION, tmp_path / "t", prepare=other, progress=False)
     assert choose_settings(frames, CALIBRATION, method="correlation").arguments["method"] == "correlation"
@@ -167,5 +167,5 @@ def test_refuses_films(changes, frames, error, name) -> None:
 
 def test_frames_are_prepared_once() -> None:
     frames = Preparation()(np.zeros((2, 40, 40)))
-    with pytest.raises(ValueError, match="^prepare: "):
+    with pytest.raises(ValueError, match=r"^prepare: "):
         batch(frames, CALIBRATION, prepare=Preparation(), progress=False)

@@ -49,8 +49,8 @@ between 0.8 and 0.97 on the planar and the synthetic scan, where the same 15 and
 
 ALIKE = 0.85
 """Median correlation of the beads with the average bead below which they do not go through focus together: what was
-given as a scan is a film. Chosen on two scans, also with noise of 300 counts (0.97 or more), and on films of the paper's
-channel and of a vortex at three speeds each (0.75 or less)."""
+given as a scan is a film. Chosen on two scans, also with noise of 300 counts (0.97 or more), and on films of the
+paper's channel and of a vortex at three speeds each (0.75 or less)."""
 
 WANDERS = 0.25
 """Drift of a bead that is the only one, as a fraction of a template, from which on it is taken for a particle that

@@ -183,7 +183,7 @@ def measure(
 def _calibrated(
     scan: Images, z_um: NDArray, hashes: list[str], choices: dict[str, object], prepare: Preparation | None
 ) -> Calibration:
-    """Calibration from a scan (N, rows, columns); that of a scan with these hashes is made once and kept in the cache."""
+    """Calibration from a scan (N, rows, columns), made once for files of these hashes and then kept in the cache."""
     note = {} if prepare is None or prepare.camera is None else prepare.camera.note()
     said = json.dumps([sorted(hashes), z_um.tolist(), choices, note], sort_keys=True, default=np.ndarray.tolist)
     folder = sources_folder("calibrations")
@@ -307,7 +307,8 @@ def _tracked(
     from gdptlab.tracking import link, velocities
 
     counted = particles.assign(frame=(particles["frame"] - prepare.first) // prepare.every)
-    tracks = link(counted, search_range=search_range, predictor="nearest velocity")
+    n = counted["frame"].nunique()
+    tracks = link(counted, search_range=search_range, predictor="nearest velocity", min_rows=min(10, (n + 1) // 2))
     tracks = velocities(tracks, frame_rate_hz / prepare.every)
     return tracks.assign(frame=prepare.first + prepare.every * tracks["frame"])
 
