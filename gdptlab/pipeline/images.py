@@ -16,6 +16,7 @@ import tifffile
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gdptlab._checks import number, real_array, whole
+from gdptlab.pipeline import readers
 
 SUFFIXES = (".tif", ".tiff")
 """Ends of the names of files that are looked for in a folder, in lower or upper case."""
@@ -29,6 +30,10 @@ NUMBER = r"[-+]?[0-9]+(?:[.,][0-9]+)?(?:[eE][-+][0-9]+)?"
 MOST_CHANNELS = 7
 """Largest number of channels. ImageJ allows no more; a longer axis that says channel is one of time or depth (files
 that tifffile writes for ImageJ, without being told axes, call it channel)."""
+
+STRIDE = 2**32
+"""Number of a plane of the next position, in a file that a reader of `readers` opens, less that of the same plane.
+Derived: no position has as many."""
 
 COLOUR = "for a colour image choose the channel with the particles, or the mean of all, and save it as grey"
 """Advice in the error about a colour image."""
@@ -119,9 +124,17 @@ class Images(Sequence):
         (rows, columns), dtype = self._frame
         for file, locations in groupby(self._locations.tolist(), lambda location: location[0]):
             path, raw, stamp = self._files[file]
+            if stamp not in (None, _stamp(path)):
+                raise ValueError(f"path: got {path.name!r}, which has changed since it was opened: open it again")
+            if path.suffix.lower() in readers.PACKAGES:
+                numbers = [offset for _, offset in locations]
+                with _others_opened(path, numbers[0] // STRIDE) as planes:
+                    for image in planes.read(number % STRIDE for number in numbers):
+                        if (image.shape, image.dtype) != self._frame:
+                            raise _refused(path, f"an image of {_described(image)}", f"are those of {_described(self)}")
+                        yield image
+                continue
             with _opened(path) as tif:
-                if stamp not in (None, _stamp(path)):
-                    raise ValueError(f"path: got {path.name!r}, which has changed since it was opened: open it again")
                 for _, offset in locations:
                     if raw:
                         tif.filehandle.seek(offset)
@@ -146,7 +159,7 @@ class Images(Sequence):
 
 
 def open_images(path: str | os.PathLike[str], *, channel: int | None = None, position: int | None = None) -> Images:
-    """Open grey images in TIFF files, without reading them yet.
+    """Open grey images in TIFF files, or in others that `readers` knows, without reading them yet.
 
     Arrays of any kind (memory maps, dask arrays, sequences of pims) need no opening: `batch` takes them as they are.
 
@@ -156,11 +169,13 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
         A file of one or more images (OME-TIFF and ImageJ included; a set of OME-TIFFs by any one of them), a folder
         of such files, or a folder and a pattern, as in "film/*_green.tif". Where the first holds one image, so must
         all. Files are sorted by name, numbers in it by their value: frame2 before frame10. Where the names give depths
-        (as `open_scan` reads them: z_-50, z_0, z_50) the files are sorted by depth.
+        (as `open_scan` reads them: z_-50, z_0, z_50) the files are sorted by depth. Or, with ``pip install
+        gdptlab[formats]``, one file of Nikon's (.nd2), Zeiss's (.czi) or Leica's (.lif), or a grey video (.avi, .mp4,
+        .mov; of one in colour the brightness).
     channel : int, optional
         Number of the channel, from 0, in files that have several.
     position : int, optional
-        Number of the position on the slide, from 0, in OME-TIFFs that have several.
+        Number of the position on the slide (scene, image), from 0, in files that have several.
 
     Returns
     -------
@@ -190,6 +205,8 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
         for name, value in (("channel", channel), ("position", position))
     }
     paths = _paths(Path(path).absolute())
+    if paths[0].suffix.lower() in readers.PACKAGES:
+        return _others(paths[0], chosen["channel"], chosen["position"])
     number, files, locations, frame, um_per_px = {}, [], [], None, None
     for path in paths:
         if path in number:  # a part of a set of OME-TIFFs
@@ -454,12 +471,48 @@ def _found(
     return [(path.with_name(page.parent.filename), page.offset) for page in pages], False
 
 
+def _others(path: Path, channel: int | None, position: int | None) -> Images:
+    """Images of a file that a reader of `readers` opens."""
+    with _others_opened(path, position or 0) as planes:
+        if position is None and planes.positions > 1:
+            raise _refused(
+                path, f"{planes.positions} positions", f"is one: choose it, position=0 to {planes.positions - 1}"
+            )
+        if position is not None and position >= planes.positions:
+            raise ValueError(f"position: got {position}, allowed are 0 to {planes.positions - 1} in {path.name!r}")
+        number = _chosen(planes.axes, planes.lengths, path, channel)
+        frame = (tuple(planes.shape), planes.dtype)
+    if not len(number):
+        raise _refused(path, "no images", "are files with some")
+    locations = np.stack([np.zeros_like(number), (position or 0) * STRIDE + number], axis=1)
+    return Images([File(path, False, _stamp(path))], locations, frame, planes.um_per_px)
+
+
+@contextmanager
+def _others_opened(path: Path, position: int) -> Iterator[readers.Planes]:
+    """A file that a reader of `readers` opens; what is wrong with it is a ValueError that names it."""
+    try:
+        with readers.opened(path, position) as planes:
+            yield planes
+    except IndexError as error:
+        raise ValueError(f"position: got {position}, which is not in {path.name!r}") from error
+    except Exception as error:  # of many kinds
+        if re.match("(path|channel|position): got", str(error)):
+            raise
+        raise ValueError(f"path: got {path.name!r}, which cannot be read: {error}") from error
+
+
 def _of_channel(series: tifffile.TiffPageSeries, path: Path, channel: int | None) -> NDArray[np.int64]:
     """Numbers of the images, in the order of the file, that belong to a channel of a series."""
     axes, shape = series.axes.replace("YX", ""), series.shape[: len(series.axes.replace("YX", ""))]
-    number = np.arange(int(np.prod(shape))).reshape(shape)
     if axes == "C" and shape[0] > MOST_CHANNELS:
         axes = "T"
+    return _chosen(axes, shape, path, channel)
+
+
+def _chosen(axes: str, shape: tuple[int, ...], path: Path, channel: int | None) -> NDArray[np.int64]:
+    """Numbers of the images of a channel, of all along these axes, if beside it they have one axis."""
+    number = np.arange(int(np.prod(shape))).reshape(shape)
     channels = shape[axes.index("C")] if "C" in axes else 1
     if channel is None and channels > 1:
         raise _refused(path, f"{channels} channels", f"is one: choose it, channel=0 to {channels - 1}")
@@ -467,8 +520,8 @@ def _of_channel(series: tifffile.TiffPageSeries, path: Path, channel: int | None
         raise ValueError(f"channel: got {channel}, allowed are 0 to {channels - 1} in {path.name!r}")
     if "C" in axes:
         number, axes = number.take(channel, axis=axes.index("C")), axes.replace("C", "")
-    if len(axes) > 1:
-        kind = f"images along the axes {series.axes} of lengths {series.shape}"
+    if sum(n > 1 for n in number.shape) > 1:
+        kind = f"images along the axes {axes} of lengths {number.shape}"
         raise _refused(path, kind, "is one axis, time or depth, beside channel, rows and columns")
     return number.ravel()
 
