@@ -146,6 +146,7 @@ def measure_images(options: argparse.Namespace) -> int:
         search_range_um=options.search_range,
         depth_factor=options.indices or options.depth_factor,
         side=options.side,
+        flat_field=options.flat_field,
         prepare=_preparation(options),
         n_jobs=options.jobs,
         **{name: value for name, value in choices.items() if value is not None},
@@ -252,6 +253,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     measures.add_argument(
         "--side", help="near or far: only depths on this side of focus, smaller or larger, where both look alike"
+    )
+    measures.add_argument(
+        "--flat-field", action="store_true", help="take tilt and curvature of the focal surface from the depths"
     )
     prepares = measures.add_argument_group("what is done to the frames first")
     prepares.add_argument("--dark", metavar="FILE", help="image without light; of several, the mean")

@@ -433,7 +433,7 @@ NAN[2, 3, 4], INF[2, 3, 4], FLAT[[1, 4]] = np.nan, np.inf, 7
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"stack": STACK[:, :8, :8]}, ValueError, "^stack:"),
+        ({"stack": STACK[:, :2, :2]}, ValueError, "^stack:"),
         ({"stack": STACK[:, :7]}, ValueError, "^stack:"),
         ({"stack": STACK[0]}, ValueError, "^stack:"),
         ({"stack": STACK[:2], "z_um": [0, 1]}, ValueError, "^stack:"),

@@ -13,6 +13,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "settings": ["Settings", "choose_settings"],
         "measuring": ["Measured", "measure"],
         "stream": ["batch_to_parquet"],
+        "surface": ["flattened"],
         "tables": ["in_um", "save_points", "save_table"],
     },
 )

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from gdptlab._checks import positive
+from gdptlab._checks import flag, positive
 from gdptlab._files import keep_arrays, kept_arrays, sources_folder, written_whole
 from gdptlab.calibration import Calibration
 from gdptlab.pipeline.beads import ScanReport
@@ -22,6 +22,7 @@ from gdptlab.pipeline.page import write_page
 from gdptlab.pipeline.quality import report
 from gdptlab.pipeline.settings import Settings, choose_settings
 from gdptlab.pipeline.stream import batch_to_parquet
+from gdptlab.pipeline.surface import flattened
 from gdptlab.pipeline.tables import about, as_json, in_um, save_points, save_table
 from gdptlab.preparation import Preparation, Prepared, preparation
 
@@ -81,6 +82,7 @@ def measure(
     search_range_um: tuple[float, float, float] | None = None,
     depth_factor: float | tuple[float, float] | None = None,
     side: str | None = None,
+    flat_field: bool = False,
     prepare: Preparation | None = None,
     n_jobs: int = 1,
     progress: bool = True,
@@ -111,6 +113,8 @@ def measure(
         Depth in the sample over travel of the stage, as for `Calibration.with_depth_factor`, if `z_um` is travel.
     side : str, optional
         "near" or "far": only depths on this side of focus, as for `Calibration.one_side`.
+    flat_field : bool
+        Take tilt and curvature of the focal surface, as the scan's beads show them, from the depths (`flattened`).
     prepare : Preparation, optional
         What is done to the film's frames; its dark and flat image correct the scan, too.
     n_jobs, progress
@@ -142,7 +146,7 @@ def measure(
     um_per_px = _um_per_px(um_per_px, film, scanned)
     folder = _folder(folder, frames)
     given = {"z_um": z_um, "um_per_px": um_per_px, "frame_rate_hz": frame_rate_hz, "search_range_um": search_range_um}
-    given |= {"depth_factor": depth_factor, "side": side}
+    given |= {"depth_factor": depth_factor, "side": side, "flat_field": flag("flat_field", flat_field)}
     if prepare is not None:
         given["prepare"] = preparation(prepare).note()
     frames_used = film if prepare is None else prepare(film)
@@ -170,6 +174,8 @@ def measure(
     particles, tracks = pd.read_parquet(parts), None
     if settings.arguments["method"] == "correlation":
         particles = with_errors(particles, calibration)
+    if flat_field:
+        particles = flattened(particles, calibration)
     particles = in_um(particles, um_per_px)
     if frame_rate_hz is not None:
         ranges = search_range_um or _search_range(particles, calibration.z_um)
@@ -319,7 +325,9 @@ def _write(
     """Write the results into their folder: tables, what other programs open, the page and, at last, the log."""
     folder, calibration, settings = measured.folder, measured.calibration, measured.settings
     notes = settings.arguments | {"um_per_px": um_per_px}
-    notes |= {name: call["arguments"][name] for name in ("side", "prepare") if call["arguments"].get(name)}
+    notes |= {
+        name: call["arguments"][name] for name in ("side", "flat_field", "prepare") if call["arguments"].get(name)
+    }
     calibration.save(folder / "calibration.npz")
     save_table(measured.particles, folder / "particles.csv", calibration, **notes)
     save_points(measured.particles, folder / "points_napari.csv", "napari")

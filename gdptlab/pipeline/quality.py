@@ -216,7 +216,7 @@ def _plane(beads: pd.DataFrame, z_um: NDArray, error_um: float) -> Judgement:
     uneven = float(beads.loc[beads["verdict"] == "used", "offset_um"].std(ddof=0))
     step, span = float(np.median(np.diff(z_um))), z_um[-1] - z_um[0]
     finding = f"beads come into focus {uneven:.2g} µm apart (RMS over the field)"
-    advice = "The field is curved or tilted, which goes into z unless it is corrected."
+    advice = "The field is curved or tilted, which goes into z unless it is corrected (`flattened`, or field=True)."
     look = uneven > max(step / 2, error_um)
     return Judgement("the plane of beads", bool(uneven > UNEVEN * span), look, finding, advice)
 
