@@ -144,6 +144,7 @@ def measure_images(options: argparse.Namespace) -> int:
         um_per_px=options.um_per_px,
         frame_rate_hz=options.rate,
         search_range_um=options.search_range,
+        cells=tuple(options.cells),
         depth_factor=options.indices or options.depth_factor,
         side=options.side,
         flat_field=options.flat_field,
@@ -151,6 +152,7 @@ def measure_images(options: argparse.Namespace) -> int:
         n_jobs=options.jobs,
         **{name: value for name, value in choices.items() if value is not None},
     )
+    print(measured.summary())
     return _say(measured.folder, measured.quality)
 
 
@@ -237,6 +239,14 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         metavar=("X", "Y", "Z"),
         help="how far from where it is expected a particle is looked for in the next frame, µm",
+    )
+    measures.add_argument(
+        "--cells",
+        nargs=3,
+        type=int,
+        default=(8, 8, 3),
+        metavar=("X", "Y", "Z"),
+        help="cells of the mean velocity field, if particles are linked",
     )
     measures.add_argument(
         "--depth-factor",

@@ -119,6 +119,20 @@ def table(name: str, value: Any, columns: Iterable[str]) -> pd.DataFrame:
     return value
 
 
+def positions(name: str, value: Any, columns: Iterable[str]) -> pd.DataFrame:
+    """Return `value` if it is a table with finite numbers, up to `LARGEST`, in these columns.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is not.
+    """
+    columns = list(columns)
+    if not (table(name, value, columns)[columns].astype(float).abs() <= LARGEST).all(axis=None):
+        raise ValueError(f"{name}: got NaN, infinity or numbers beyond {LARGEST:g}, allowed are numbers to there")
+    return value
+
+
 def real_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
     """Return `value` as a finite float32 array of `ndim` axes, none of them empty.
 

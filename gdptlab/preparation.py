@@ -208,7 +208,8 @@ class Prepared(Sequence):
     """
 
     def __init__(self, preparation: Preparation, frames: Sequence[ArrayLike]) -> None:
-        if not hasattr(frames, "__len__") or not hasattr(frames, "__getitem__") or isinstance(frames, dict | str):
+        sized = hasattr(frames, "__len__") and hasattr(frames, "__getitem__") and getattr(frames, "ndim", 1) > 0
+        if not sized or isinstance(frames, dict | str):
             raise TypeError(f"frames: got a {type(frames).__name__}, allowed is a sequence of arrays, of known length")
         last = len(frames) if preparation.last is None else min(preparation.last + 1, len(frames))
         number = range(preparation.first, last, preparation.every)

@@ -129,6 +129,9 @@ def test_what_is_in_the_folder(folder, measured):
             "tracks.csv.json",
             "tracks.pvd",
             "tracks",
+            "field.csv",
+            "field.csv.json",
+            "field.vtr",
         ),
         *("points_napari.csv", "quality.csv", "settings.csv", "calibration.npz", "frames", "log.json", "call.json"),
     }
@@ -188,6 +191,7 @@ def test_results_lie_beside_the_film_unless_told(folder):
         ({"folder": "scan"}, ValueError, "folder"),
         ({"folder": "film.tif"}, ValueError, "folder"),
         ({"colour": "red"}, TypeError, "choices"),
+        ({"cells": 3}, TypeError, "cells"),
         ({"prepare": "dark"}, TypeError, "prepare"),
     ],
 )

@@ -39,10 +39,10 @@ def with_errors(table: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
     TypeError, ValueError
         If an argument is not of that form.
     """
-    check.table("table", table, ("x_px", "y_px", "z_um", "cm"))
+    check.positions("table", table, ("x_px", "y_px", "z_um", "cm"))
     z_um, cm = table["z_um"].to_numpy(dtype=float), table["cm"].to_numpy(dtype=float)
-    if not ((cm > 0) & (cm <= 1)).all():
-        raise ValueError("table: got cm that is not above 0 and at most 1, allowed is that of particles")
+    if not ((cm > 1e-6) & (cm <= 1)).all():
+        raise ValueError("table: got cm that is not above 1e-6 and at most 1, allowed is that of particles")
     depths = checked(calibration).z_um
     k = np.rint(np.interp(z_um, depths, np.arange(len(depths)))).astype(int)
     position = table[["y_px", "x_px"]].to_numpy(dtype=float)

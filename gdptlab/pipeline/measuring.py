@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from gdptlab._checks import flag, positive
+from gdptlab._checks import flag, positive, whole
 from gdptlab._files import keep_arrays, kept_arrays, sources_folder, written_whole
 from gdptlab.calibration import Calibration
 from gdptlab.pipeline.beads import ScanReport
@@ -39,6 +39,11 @@ with half of it, the ranges of neighbours touch but do not overlap."""
 DEPTH = 0.1
 """Search range along z, if none is given, as a fraction of the range of depths. As the largest error of z of a pair in
 `match`: what is farther off is another particle."""
+
+
+CELLS = (8, 8, 3)
+"""Cells along x, y and z of the mean velocity field, if none are given. Chosen: of a few thousand rows, each then holds
+several."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +75,17 @@ class Measured:
         """What is bad about the calibration, by the names of the rows of `quality`."""
         return self.quality.index[self.quality["verdict"] == "bad"].tolist()
 
+    def summary(self, frames: Sequence[int] = ()) -> str:
+        """How many particles and tracks there are, in words; of these frames, or of those with a particle."""
+        found = self.particles.groupby("frame").size()
+        found = found.reindex(frames, fill_value=0) if len(frames) else found
+        if self.particles.empty:
+            return "No particles."
+        text = f"{len(self.particles)} particles in {len(found)} frames, {found.min()} to {found.max()} in a frame."
+        if self.tracks is not None:
+            text += f" {self.tracks['particle'].nunique()} tracks, of {len(self.tracks)} of them."
+        return text
+
 
 def measure(
     scan: str | os.PathLike[str],
@@ -80,6 +96,7 @@ def measure(
     um_per_px: float | None = None,
     frame_rate_hz: float | None = None,
     search_range_um: tuple[float, float, float] | None = None,
+    cells: tuple[int, int, int] = CELLS,
     depth_factor: float | tuple[float, float] | None = None,
     side: str | None = None,
     flat_field: bool = False,
@@ -109,6 +126,8 @@ def measure(
     search_range_um : (x, y, z), optional
         As for `tracking.link`. If not given, `NEIGHBOUR` of the distance between neighbours, and `DEPTH` of the range
         of depths.
+    cells : (x, y, z)
+        How many cells the mean velocity field has along each axis, if particles are linked (`tracking.mean_field`).
     depth_factor : float or (n_immersion, n_sample), optional
         Depth in the sample over travel of the stage, as for `Calibration.with_depth_factor`, if `z_um` is travel.
     side : str, optional
@@ -127,8 +146,9 @@ def measure(
     -------
     Measured
         In its folder: `report.html`, a page that shows whether to trust it; `particles.csv` and `points_napari.csv`;
-        with a frame rate `tracks.csv` and, for ParaView, `tracks.pvd`; `quality.csv`, `settings.csv`,
-        `calibration.npz`; `frames`, the parts of the table; `log.json`: inputs with their hashes, arguments, versions.
+        with a frame rate `tracks.csv` and `field.csv`, for ParaView `tracks.pvd` and `field.vtr`; `quality.csv`,
+        `settings.csv`, `calibration.npz`; `frames`, the parts of the table; `log.json`: inputs with their hashes,
+        arguments, versions.
 
     Raises
     ------
@@ -141,6 +161,9 @@ def measure(
         raise TypeError(f"choices: got {', '.join(unknown)}, allowed are {', '.join((*OF_SCAN, *OF_FRAMES))}")
     if frame_rate_hz is not None:
         positive("frame_rate_hz", frame_rate_hz)
+    if not isinstance(cells, tuple | list) or len(cells) != 3:
+        raise TypeError(f"cells: got {cells!r}, allowed are three whole numbers: along x, y and z")
+    cells = tuple(whole("cells", n, 1, 1000) for n in cells)
     scanned, depths = _opened_scan(scan, z_um)
     film = open_images(frames)
     um_per_px = _um_per_px(um_per_px, film, scanned)
@@ -180,7 +203,7 @@ def measure(
     if frame_rate_hz is not None:
         ranges = search_range_um or _search_range(particles, calibration.z_um)
         tracks = _tracked(particles, frame_rate_hz, ranges, prepare or Preparation())
-        given["search_range_um"] = tuple(ranges)
+        given |= {"search_range_um": tuple(ranges), "cells": cells}
     measured = Measured(folder, calibration, quality, settings, particles, tracks)
     _write(measured, frames_used, um_per_px, frame_rate_hz, {"inputs": inputs, "arguments": given | choices})
     return measured
@@ -335,35 +358,46 @@ def _write(
         with written_whole(folder / f"{name}.csv") as temporary:
             table.to_csv(temporary)
     if measured.tracks is not None:
-        from gdptlab.tracking import save_paraview_tracks
+        from gdptlab.tracking import mean_field, save_paraview_field, save_paraview_tracks
 
         ranges = call["arguments"]["search_range_um"]
         save_table(measured.tracks, folder / "tracks.csv", calibration, **notes, search_range_um=ranges)
         save_paraview_tracks(measured.tracks, folder / "tracks.pvd", frame_rate_hz)
+        edges = _edges(measured.tracks, call["arguments"]["cells"])
+        if edges and measured.tracks["vx_um_s"].notna().any():
+            field = mean_field(measured.tracks, edges)
+            save_table(field, folder / "field.csv", calibration, **notes, search_range_um=ranges)
+            save_paraview_field(field, folder / "field.vtr")
     write_page(folder / "report.html", f"gdptlab: {folder.name}", _page(measured, film))
     with written_whole(folder / "log.json") as temporary:
         temporary.write_text(as_json(call | about(calibration, settings.arguments)), encoding="utf-8")
+
+
+def _edges(tracks: pd.DataFrame, cells: tuple[int, int, int]) -> dict[str, NDArray]:
+    """Edges (n + 1,) of the cells of a grid about all positions, by axis; none if they do not span it."""
+    edges = {}
+    for axis, n in zip(("x_um", "y_um", "z_um"), cells, strict=True):
+        low, high = tracks[axis].min(), tracks[axis].max()
+        if not low < high:
+            return {}
+        edges[axis] = np.linspace(low, high, n + 1)
+    return edges
 
 
 def _page(measured: Measured, film: Images | Prepared) -> dict[str, object]:
     """Headings, and what stands under them, of the page of results."""
     from gdptlab import plots
 
-    particles, tracks = measured.particles, measured.tracks
-    bad = measured.bad
+    particles, bad = measured.particles, measured.bad
     verdict = f"Bad: {', '.join(bad)}. Read the advice before you believe what comes." if bad else "Nothing is bad."
     done = film.preparation if isinstance(film, Prepared) else Preparation()
     numbers = range(done.first, done.first + done.every * len(film), done.every)
-    found = particles.groupby("frame").size().reindex(numbers, fill_value=0)
-    text = f"{len(particles)} particles in {len(film)} frames, {found.min()} to {found.max()} in a frame."
-    if tracks is not None:
-        text += f" {tracks['particle'].nunique()} tracks, of {len(tracks)} of them."
     parts = {
         "Is the calibration good?": verdict,
         "What was asked of it": measured.quality,
         "Beads and depths": plots.calibration_page(measured.calibration),
         "Settings": measured.settings.table,
-        "What was measured": text,
+        "What was measured": measured.summary(numbers),
     }
     k = len(film) // 2
     left, top = (0, 0) if done.region is None else done.region[:2]

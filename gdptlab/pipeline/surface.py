@@ -42,7 +42,8 @@ def flattened(table: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
     TypeError, ValueError
         If an argument is not of that form; if the calibration knows of fewer than six beads, or they lie on a line.
     """
-    check.table("table", table, ("x_px", "y_px", "z_um"))
+    check.positions("table", table, ("x_px", "y_px", "z_um"))
+    check.table("table", table, {"z_std_um"} & set(table))
     report = checked(calibration).report
     beads = None if report is None else report.beads.query("verdict == 'used'")
     n = 0 if beads is None else len(beads)

@@ -7,7 +7,7 @@ from scipy.sparse import coo_array, hstack
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import lsqr
 
-from gdptlab._checks import table as check_table
+from gdptlab._checks import positions
 from gdptlab.tracking.tracks import must_be_tracks, positions_of
 
 FEWEST = 2
@@ -50,7 +50,10 @@ def drift(tracks: pd.DataFrame, particles: ArrayLike) -> pd.DataFrame:
     1      1   0.5   2.0  2
     """
     must_be_tracks(tracks)
-    columns, chosen = positions_of("tracks", tracks), np.unique(np.asarray(particles))
+    columns, chosen = positions_of("tracks", tracks), np.asarray(particles)
+    if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "iu"):
+        raise ValueError(f"particles: got {particles!r}, allowed is a list of whole numbers")
+    chosen = np.unique(chosen)
     absent = sorted(set(chosen.tolist()) - set(tracks["particle"].tolist()))
     if absent or not len(chosen):
         raise ValueError(f"particles: got {absent or 'none'}, allowed are numbers in the column particle of tracks")
@@ -100,9 +103,9 @@ def without_drift(table: pd.DataFrame, drift: pd.DataFrame) -> pd.DataFrame:
     TypeError, ValueError
         If an argument is not of that form, or the columns of the one are not in the other.
     """
-    check_table("drift", drift, ["frame"])
+    positions("drift", drift, ["frame"])
     columns = positions_of("drift", drift)
-    check_table("table", table, ["frame", *columns])
+    positions("table", table, ["frame", *columns])
     if drift.empty or not (np.diff(drift["frame"]) > 0).all():
         raise ValueError("drift: got frames that do not increase, or none, allowed is a table from `drift`")
     moved = {name: np.interp(table["frame"], drift["frame"], drift[name]) for name in columns}
