@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import groupby
@@ -26,6 +27,10 @@ UM = {"m": 1e6, "cm": 1e4, "mm": 1e3, "µm": 1.0, "μm": 1.0, "um": 1.0, "micron
 
 NUMBER = r"[-+]?[0-9]+(?:[.,][0-9]+)?(?:[eE][-+][0-9]+)?"
 """Regular expression of a number in a file name: with a sign, decimals after a point or a comma, and an exponent."""
+
+RESTING = 0.05
+"""Largest step, as a fraction of the largest, of a stage that stands still. Chosen: stages are set to a hundredth of a
+step or so, and scans are even."""
 
 MOST_CHANNELS = 7
 """Largest number of channels. ImageJ allows no more; a longer axis that says channel is one of time or depth (files
@@ -261,7 +266,7 @@ def open_scan(
     names: str | None = None,
     channel: int | None = None,
     position: int | None = None,
-) -> tuple[Images, NDArray[np.float64]]:
+) -> tuple[Images | NDArray[np.float32], NDArray[np.float64]]:
     """Open the images of a calibration scan, and find their depths.
 
     The depths come from where they begin and the step between two images; from a CSV file; or, if neither is given,
@@ -276,7 +281,7 @@ def open_scan(
         Depth of the first image, and from each to the next (negative if the scan went down).
     csv : str or path-like, optional
         A table with a column `z_um` and a row for each image, in their order. With semicolons between the columns,
-        decimals follow a comma.
+        decimals follow a comma. Images at either end between which the stage stood still are averaged, with a warning.
     names : str, optional
         A regular expression that finds the depth, µm, in a file name as its only group, as in r"_z(-?[0-9.]+)um".
     channel, position : int, optional
@@ -285,7 +290,7 @@ def open_scan(
     Returns
     -------
     images : Images
-        By increasing depth.
+        By increasing depth; an array (n, rows, columns) if some were averaged.
     z_um : float array (n,)
 
     Raises
@@ -311,6 +316,8 @@ def open_scan(
         real_array("start_um, step_um", z_um, 1)
     elif csv is not None:
         z_um = _depths_of_table(csv, len(images))
+        images, z_um = _without_rests(images, z_um)
+        _unrepeated("csv", z_um)
     else:
         z_um = _depths_of_names(images.names, names)
     order = np.argsort(z_um, kind="stable")
@@ -335,7 +342,28 @@ def _depths_of_table(path: str | os.PathLike[str], n: int) -> NDArray[np.float64
             f"{n} images"
         )
     real_array("csv", table["z_um"], 1)
-    return _unrepeated("csv", table["z_um"].to_numpy(dtype=np.float64))
+    return table["z_um"].to_numpy(dtype=np.float64)
+
+
+def _without_rests(
+    images: Images, z_um: NDArray[np.float64]
+) -> tuple[Images | NDArray[np.float32], NDArray[np.float64]]:
+    """Images and depths (n,); those at which the stage stood still at either end are averaged, with a warning."""
+    steps = np.abs(np.diff(z_um))
+    moving = np.flatnonzero(steps > RESTING * steps.max(initial=0))
+    if not len(moving):
+        return images, z_um
+    first, last = int(moving[0]), int(moving[-1]) + 1  # the last image before the stage moves, the first after
+    if first == 0 and last == len(z_um) - 1:
+        return images, z_um
+    warnings.warn(
+        f"csv: the stage stood still at {z_um[first]:g} µm in {first + 1} images and at {z_um[last]:g} µm in "
+        f"{len(z_um) - last}: they are averaged",
+        stacklevel=3,
+    )
+    parts = [slice(0, first + 1), *(slice(k, k + 1) for k in range(first + 1, last)), slice(last, None)]
+    mean = np.stack([np.mean(np.asarray(images[part]), axis=0, dtype=np.float64) for part in parts])
+    return mean.astype(np.float32), np.array([z_um[part].mean() for part in parts])
 
 
 def _unrepeated(name: str, z_um: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -521,7 +549,7 @@ def _chosen(axes: str, shape: tuple[int, ...], path: Path, channel: int | None) 
     if "C" in axes:
         number, axes = number.take(channel, axis=axes.index("C")), axes.replace("C", "")
     if sum(n > 1 for n in number.shape) > 1:
-        kind = f"images along the axes {axes} of lengths {number.shape}"
+        kind = f"images along the axes {axes}YX, of lengths {number.shape}"
         raise _refused(path, kind, "is one axis, time or depth, beside channel, rows and columns")
     return number.ravel()
 
