@@ -18,6 +18,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "experiment": [
             "TRIGGERS",
             "TRIGGER_COLOURS",
+            "TRIGGER_TITLES",
             "draw_monitor",
             "fig4_acoustophoresis",
             "player",
@@ -25,7 +26,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "replay_view",
             "save_animation",
         ],
-        "figure5": ["error_against_tau", "fig5_settings", "fig5_times"],
+        "figure5": ["error_against_tau", "fig5_settings", "fig5_times", "three_answers"],
         "frames": ["circled", "contact_sheet", "draw_in_space", "frame_with_particles", "particles_3d", "side_by_side"],
         "knobs": ["panel", "slide"],
         "limits": ["biases", "errors_against_bound", "expected_errors"],
@@ -33,6 +34,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "notebook": ["end_notebook"],
         "overlap": ["RESIDUAL_END", "error_ratios", "film_followed", "found_and_left", "laid_bare"],
         "quality": ["calibration_page", "depth_against_truth", "measured_page", "symptoms"],
+        "rotatable": ["Rotatable", "turn_particles", "turn_paths"],
         "speed": ["breakdown", "frame_times", "real_time", "scaling"],
         "style": ["COLOURS", "FIGURES", "bare", "depth_label", "extent", "folder", "save", "use"],
         "tracks": [
