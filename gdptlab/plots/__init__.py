@@ -31,7 +31,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "knobs": ["panel", "slide"],
         "limits": ["biases", "errors_against_bound", "expected_errors"],
         "live": ["latencies", "live_panel", "loop_and_timer", "one_loop", "watch_live"],
-        "notebook": ["end_notebook"],
+        "notebook": ["all_measured", "end_notebook", "keep_measured", "measured_lines", "quote_measured"],
         "overlap": ["RESIDUAL_END", "error_ratios", "film_followed", "found_and_left", "laid_bare"],
         "quality": ["calibration_page", "depth_against_truth", "measured_page", "symptoms"],
         "rotatable": ["Rotatable", "turn_particles", "turn_paths"],
