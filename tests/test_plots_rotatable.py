@@ -9,6 +9,7 @@ import pytest
 
 from gdptlab import plots
 from gdptlab.experiment import Focusing, Trajectories
+from gdptlab.plots.rotatable import MOMENTS
 
 PLOTLY = "application/vnd.plotly.v1+json"
 
@@ -22,18 +23,24 @@ def bundles() -> dict[str, dict]:
     return {name: picture._repr_mimebundle_() for name, picture in shown.items()}
 
 
+def unpacked(part: dict[str, str]) -> np.ndarray:
+    """Numbers of a packed array."""
+    return np.frombuffer(b64decode(part["bdata"]), dtype="<" + part["dtype"])
+
+
 def test_particles_stand_where_they_were_measured(bundles: dict[str, dict]) -> None:
     measured, true = bundles["particles"][PLOTLY]["data"]
-    assert (measured["x"], measured["y"], measured["z"]) == ([5.0, 10.0], [2.5, 20.0], [-3.0, 12.3])
-    assert (true["name"], true["x"]) == ("true", [5.0])
+    for axis, expected in {"x": [5, 10], "y": [2.5, 20], "z": [-3, 12.34]}.items():
+        np.testing.assert_allclose(unpacked(measured[axis]), expected, rtol=1e-6)
+    assert true["name"] == "true" and unpacked(true["x"]).tolist() == [5.0]
     assert bundles["particles"][PLOTLY]["layout"]["scene"]["yaxis"]["autorange"] == "reversed"  # as in the image
 
 
 def test_paths_lie_in_the_field_of_view_and_are_not_joined(bundles: dict[str, dict]) -> None:
     (trace,) = bundles["paths"][PLOTLY]["data"]
-    x = np.array(trace["x"], dtype=float)
-    assert np.nanmin(x) >= 0 and np.isnan(x[26::27]).all() and np.isfinite(x).sum() > 20
-    assert len(trace["x"]) == len(trace["y"]) == len(trace["z"]) == len(trace["line"]["color"])
+    x, y, z, colour = (unpacked(part) for part in (trace["x"], trace["y"], trace["z"], trace["line"]["color"]))
+    assert np.nanmin(x) >= 0 and np.isnan(x[MOMENTS :: MOMENTS + 1]).all() and np.isfinite(x).sum() > 20
+    assert len(x) == len(y) == len(z) == len(colour)
 
 
 @pytest.mark.parametrize("name", ["particles", "paths"])

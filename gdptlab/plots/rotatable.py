@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from gdptlab.experiment.channel import Trajectories
 from gdptlab.plots.experiment import draw_paths
@@ -20,7 +21,7 @@ from gdptlab.plots.style import styled
 PLOTLY = "application/vnd.plotly.v1+json"
 """Type of a description that plotly draws."""
 
-MOMENTS = 26
+MOMENTS = 21
 """Points of each path that can be turned: enough to look smooth, few enough for a notebook to stay small."""
 
 
@@ -54,9 +55,10 @@ class Rotatable:
         return {PLOTLY: self.described, "image/png": still, "text/plain": "a picture in space (turns in JupyterLab)"}
 
 
-def _rounded(values: object) -> list[float | None]:
-    """Numbers to a tenth; a gap where there is none."""
-    return [None if np.isnan(v) else round(float(v), 1) for v in np.ravel(values)]
+def _packed(values: ArrayLike) -> dict[str, str]:
+    """Numbers as plotly takes them in one string, (n,); NaN is a gap. As a list they would fill pages of a notebook."""
+    packed = np.ravel(np.asarray(values, dtype="<f4")).tobytes()
+    return {"dtype": "f4", "bdata": b64encode(packed).decode("ascii")}
 
 
 def turn_particles(particles: pd.DataFrame, um_per_px: float, *, true: pd.DataFrame | None = None) -> Rotatable:
@@ -71,7 +73,7 @@ def turn_particles(particles: pd.DataFrame, um_per_px: float, *, true: pd.DataFr
     -------
     Rotatable
     """
-    measured = {"color": _rounded(particles["z_um"]), "colorscale": "Viridis", "size": 5}
+    measured = {"color": _packed(particles["z_um"]), "colorscale": "Viridis", "size": 5}
     measured["colorbar"] = {"title": {"text": "z (µm)"}, "len": 0.6}
     marks = [("measured", particles, measured)]
     if true is not None:
@@ -79,7 +81,7 @@ def turn_particles(particles: pd.DataFrame, um_per_px: float, *, true: pd.DataFr
     traces = []
     for name, table, marker in marks:
         x, y, z = table["x_px"] * um_per_px, table["y_px"] * um_per_px, table["z_um"]
-        places = {"x": _rounded(x), "y": _rounded(y), "z": _rounded(z)}
+        places = {"x": _packed(x), "y": _packed(y), "z": _packed(z)}
         traces.append({"type": "scatter3d", "mode": "markers", "name": name, "marker": marker} | places)
     still = particles_3d(particles, um_per_px, true=true)
     return Rotatable(still, traces, y_downwards=True)
@@ -105,8 +107,8 @@ def turn_paths(paths: Trajectories) -> Rotatable:
     colour = np.sqrt(np.broadcast_to([*times, 0.0], x.shape))
     ticks = [t for t in (0, 1, 2, 5, 10, 20, 50) if t <= paths.duration_s]
     bar = {"title": {"text": "t (s)"}, "tickvals": np.sqrt(ticks).round(3).tolist(), "ticktext": ticks, "len": 0.6}
-    line = {"color": _rounded(colour), "colorscale": "Plasma", "width": 3, "showscale": True, "colorbar": bar}
-    places = {"x": _rounded(x), "y": _rounded(y), "z": _rounded(z)}
+    line = {"color": _packed(colour), "colorscale": "Plasma", "width": 3, "showscale": True, "colorbar": bar}
+    places = {"x": _packed(x), "y": _packed(y), "z": _packed(z)}
     trace = {"type": "scatter3d", "mode": "lines", "line": line, "showlegend": False, "hoverinfo": "skip"} | places
     return Rotatable(_still(paths), [trace])
 
