@@ -98,6 +98,18 @@ def test_error_against_tau(points: pd.DataFrame) -> None:
     assert {"gdptlab", "OpenCV"} <= {t.get_text() for t in figure.axes[2].get_legend().get_texts()}
 
 
+def test_three_answers_draw_what_they_are_given(points: pd.DataFrame) -> None:
+    slower = points[points["evaluator"] == "gdptlab"].drop_duplicates(["trigger", "tau_s"])
+    change = pd.DataFrame({"setting": "a", "trigger": ["h", "w"], "mean": [0.1, 0.0], "low": -0.2, "high": 0.3})
+    columns = ["fraction_h", "fraction_w", "true_fraction_h", "true_fraction_w", "valid"]
+    seen = pd.DataFrame(np.linspace(0, 1, 10).reshape(2, 5), columns=columns, index=[0.0, 1.0])
+    figure = plots.three_answers(slower, change, seen, 0.9, {"here": 1.0}, ("none", "little", "there"))
+    shown = texts(figure)
+    assert all(word in shown for word in ("What does refinement buy?\nlittle", "here ", "valid, of the true"))
+    right = figure.axes[0].get_lines()[0].get_ydata()
+    assert list(right) == list(100 - 100 * slower[slower["trigger"] == "h"].sort_values("tau_s")["failed"])
+
+
 def test_an_animation_shows_each_moment(film: Film, monitor: pd.DataFrame, tmp_path: Path) -> None:
     animation = plots.replay_animation(film, film.truth(), monitor, [0, 50])
     plots.save_animation(animation, tmp_path / "film.gif")

@@ -23,6 +23,9 @@ from gdptlab.plots.style import COLOURS, DEPTH, GREY, STYLE, bare, scale_bar, st
 TRIGGERS = {"h": "$t_{h/3}$", "w": "$t_{w/3}$"}
 """Symbols of the two triggers."""
 
+TRIGGER_TITLES = {"h": "Height: $t_{h/3}$", "w": "Width: $t_{w/3}$"}
+"""The same with a word that is legible in a small title."""
+
 TRIGGER_COLOURS = {"h": COLOURS[0], "w": COLOURS[1]}
 """Colours of the two triggers."""
 
@@ -71,7 +74,7 @@ def _device(axes: Axes, channel: Channel) -> None:
     axes.set(xlim=(-0.7 * w, 0.66 * w), ylim=(low - 0.7 * h, 0.85 * h), xticks=[], yticks=[])
 
 
-def _paths(figure: Figure, paths: Trajectories) -> None:
+def draw_paths(figure: Figure, paths: Trajectories) -> None:
     """Draw the particles' paths through the field of view, coloured by time."""
     channel, duration = paths.focusing.channel, paths.duration_s
     w, h, length = channel.width_um, channel.height_um, paths.view_length_um
@@ -128,7 +131,7 @@ def fig4_acoustophoresis(paths: Trajectories, seen: Trajectories, times_s: Mappi
     ):
         part.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=11)
     _device(left.subplots(), channel)
-    _paths(right, paths)
+    draw_paths(right, paths)
     panels = lower.subplots(1, len(times_s), sharey=True, squeeze=False)[0]
     for panel, (name, t) in zip(panels, times_s.items(), strict=True):
         here = seen.positions(t)
