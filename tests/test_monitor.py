@@ -220,9 +220,9 @@ def test_actions_are_called_when_the_state_changes_and_only_then():
 def test_the_middle_third_is_that_of_the_replay():
     rng, channel = np.random.default_rng(0), Channel(width_um=90, height_um=60)
     table = pd.DataFrame({"y": rng.uniform(-45, 45, 40), "z_um": rng.uniform(-30, 30, 40)})
-    expected = replay.fractions(table.rename(columns={"y": "y_um"}).assign(frame=0), [0], channel).iloc[0]
+    expected = replay.fractions(table.rename(columns={"y": "y_channel_um"}).assign(frame=0), [0], channel).iloc[0]
     for of in "hw":
-        fraction = MiddleThird(of=of, channel=channel, to_channel=lambda t: t.assign(y_um=t["y"]))
+        fraction = MiddleThird(of=of, channel=channel, to_channel=lambda t: t.assign(y_channel_um=t["y"]))
         assert fraction(table) == expected[f"fraction_{of}"] > 0.1
         assert np.isnan(fraction(table[:0]))
 
@@ -232,7 +232,7 @@ def test_both_thirds_convert_a_table_once():
 
     def to_channel(table):
         calls.append(len(table))
-        return table.assign(y_um=table["y"])
+        return table.assign(y_channel_um=table["y"])
 
     thirds = middle_thirds(channel, to_channel)
     for rows in (3, 2):

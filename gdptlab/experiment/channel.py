@@ -1,7 +1,8 @@
 """The paper's experiment without its camera: a flow carries spheres while sound pushes them to the middle.
 
 Axes: x points downstream, y across the width w, z across the height h; y = z = 0 is the channel's centre,
-and the field of view is 0 ≤ x ≤ `view_length_um`. Lengths are in µm, times in s, speeds in µm/s.
+and the field of view is 0 ≤ x ≤ `view_length_um`: these are `x_channel_um`, `y_channel_um` and `z_um` of tables.
+Lengths are in µm, times in s, speeds in µm/s.
 
 All particles are alike. They move with the fluid along x, and across it at the radiation velocity of
 eqs (1a, 1b) of Rossi & Barnkob. As in the paper there is no streaming, no gravity (a 5 µm polystyrene
@@ -24,6 +25,9 @@ from gdptlab._checks import choice, positive
 TERMS = 100
 """Number of terms of the Poiseuille series. Chosen on the paper's channel: the error is 2e-6 of the peak speed on a
 wall and 3e-12 one particle radius off it; with 10 terms, 5e-4 and 6e-5. More terms only take time."""
+
+IN_CHANNEL = {"x": "x_channel_um", "y": "y_channel_um", "z": "z_um"}
+"""Columns of a position in the channel, by axis."""
 
 KNOTS = 10
 """Number of knots of the path integral in one focusing time. Chosen on 20 s in the paper's channel: the error is
@@ -86,7 +90,7 @@ class Channel:
         """Speed on the centre line."""
         return float(self.velocity(0.0, 0.0))
 
-    def velocity(self, y_um: ArrayLike, z_um: ArrayLike) -> NDArray[np.float64]:
+    def velocity(self, y_channel_um: ArrayLike, z_um: ArrayLike) -> NDArray[np.float64]:
         """Return the Poiseuille velocity along x, in µm/s, at points in the channel (y and z broadcast together).
 
         This is the single Fourier series of the rectangular duct (Bruus, Theoretical Microfluidics, 2008,
@@ -99,7 +103,7 @@ class Channel:
         ValueError
             If a point is outside the channel.
         """
-        along = _within("y_um", y_um, self.width_um / 2)
+        along = _within("y_channel_um", y_channel_um, self.width_um / 2)
         across = _within("z_um", z_um, self.height_um / 2)
         long, short = self.width_um, self.height_um
         if long < short:
@@ -313,7 +317,7 @@ class Trajectories:
     ----------
     focusing : Focusing
     start : pandas.DataFrame
-        `particle, x_um, y_um, z_um` at t = 0, centres one radius or more off the walls. Copied.
+        `particle, x_channel_um, y_channel_um, z_um` at t = 0, centres one radius or more off the walls. Copied.
     duration_s : float
         Positions are known from 0 to this time (paper: 20).
     view_length_um : float
@@ -334,14 +338,14 @@ class Trajectories:
         _positive_fields(self)
         _instance("focusing", self.focusing, Focusing)
         _instance("start", self.start, pd.DataFrame)
-        columns = ["particle", "x_um", "y_um", "z_um"]
+        columns = ["particle", *IN_CHANNEL.values()]
         if not set(columns) <= set(self.start.columns):
             raise ValueError(f"start: got columns {list(self.start.columns)}, allowed are {columns}")
         if self.start.empty:
             raise ValueError("start: got no particle, allowed is one or more")
-        _within("start x_um", self.start["x_um"], 1e9)
+        _within("start x_channel_um", self.start["x_channel_um"], 1e9)
         for axis in "yz":
-            _within(f"start {axis}_um", self.start[f"{axis}_um"], self.focusing.free_um(axis))
+            _within(f"start {IN_CHANNEL[axis]}", self.start[IN_CHANNEL[axis]], self.focusing.free_um(axis))
         object.__setattr__(self, "start", self.start[columns].reset_index(drop=True))
 
     @classmethod
@@ -398,8 +402,8 @@ class Trajectories:
                 for a, b, n in zip(starts, ends, counts, strict=True)
             ]
         )
-        start = pd.DataFrame(xyz, columns=["x_um", "y_um", "z_um"]).assign(particle=np.arange(len(xyz)))
-        start = start[start["x_um"] >= -border - drift]
+        start = pd.DataFrame(xyz, columns=list(IN_CHANNEL.values())).assign(particle=np.arange(len(xyz)))
+        start = start[start["x_channel_um"] >= -border - drift]
         if start.empty:
             least = view / ends[0]
             raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed is {least:.2g} or more, one particle in all")
@@ -422,7 +426,7 @@ class Trajectories:
 
     def _across(self, t_s: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Return y and z at these times (k,), each of shape (k, particles)."""
-        return [self.focusing.path(axis, self.start[f"{axis}_um"], t_s[:, None]) for axis in "yz"]
+        return [self.focusing.path(axis, self.start[IN_CHANNEL[axis]], t_s[:, None]) for axis in "yz"]
 
     def table(self, times_s: ArrayLike, *, border_um: float = 0.0) -> pd.DataFrame:
         """Return positions at many times.
@@ -438,7 +442,7 @@ class Trajectories:
         Returns
         -------
         pandas.DataFrame
-            `frame` (index into `times_s`), `particle, t_s, x_um, y_um, z_um`, sorted by frame.
+            `frame` (index into `times_s`), `particle, t_s, x_channel_um, y_channel_um, z_um`, sorted by frame.
 
         Raises
         ------
@@ -449,12 +453,12 @@ class Trajectories:
         if t.ndim != 1 or not np.all((t >= 0) & (t <= self.duration_s)):
             raise ValueError(f"times_s: got {times_s!r}, allowed are one axis, 0 to {self.duration_s:g} s")
         border = border_um if border_um == np.inf else positive("border_um", border_um, zero=True)
-        x = self.start["x_um"].to_numpy() + self._drift(t)
+        x = self.start["x_channel_um"].to_numpy() + self._drift(t)
         y, z = self._across(t)
         frame, row = np.nonzero((x >= -border) & (x <= self.view_length_um + border))
         columns = {"frame": frame, "particle": self.start["particle"].to_numpy()[row], "t_s": t[frame]}
-        xyz = {"x_um": x[frame, row], "y_um": y[frame, row], "z_um": z[frame, row]}
-        return pd.DataFrame(columns | xyz)
+        xyz = (x[frame, row], y[frame, row], z[frame, row])
+        return pd.DataFrame(columns | dict(zip(IN_CHANNEL.values(), xyz, strict=True)))
 
     def positions(self, t_s: float, *, border_um: float = 0.0) -> pd.DataFrame:
         """Return positions at one time, in about 1 ms: the columns of `table` but for `frame`."""
@@ -462,4 +466,4 @@ class Trajectories:
 
     def trigger_time(self, axis: str, fraction: float = 0.9) -> float:
         """Return the exact trigger time in s of all particles, in view or not: see `Focusing.trigger_time`."""
-        return self.focusing.trigger_time(axis, fraction, start_um=self.start[f"{axis}_um"])
+        return self.focusing.trigger_time(axis, fraction, start_um=self.start[IN_CHANNEL[axis]])

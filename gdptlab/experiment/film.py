@@ -184,8 +184,8 @@ class Film:
         Returns
         -------
         DataFrame
-            Copy with `x_um`, downstream from the frame's left edge, and `y_um`, from the channel's middle; of
-            `x_std_px` and `y_std_px`, if there, `x_std_um` and `y_std_um`.
+            Copy with `x_channel_um`, downstream from the frame's left edge, and `y_channel_um`, from the channel's
+            middle; of `x_std_px` and `y_std_px`, if there, `x_std_um` and `y_std_um`.
 
         Raises
         ------
@@ -197,12 +197,12 @@ class Film:
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2
         stds = {f"{a}_std_um": table[f"{a}_std_px"] * scale for a in "xy" if f"{a}_std_px" in table}
         x_px, y_px = table["x_px"].to_numpy(), table["y_px"].to_numpy()
-        return table.assign(x_um=(x_px + 0.5) * scale, y_um=(y_px - middle) * scale, **stds)
+        return table.assign(x_channel_um=(x_px + 0.5) * scale, y_channel_um=(y_px - middle) * scale, **stds)
 
     def _to_pixels(self, table: pd.DataFrame) -> pd.DataFrame:
         """Add `x_px`, `y_px` to a table in the channel's coordinates."""
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2
-        return table.assign(x_px=table["x_um"] / scale - 0.5, y_px=table["y_um"] / scale + middle)
+        return table.assign(x_px=table["x_channel_um"] / scale - 0.5, y_px=table["y_channel_um"] / scale + middle)
 
     def stack(self, n: int = 51, size: int = 61, seed: int = 0) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
         """Return a calibration stack in this film's image type, from the channel's floor to its ceiling.

@@ -14,7 +14,7 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
     Parameters
     ----------
     table : DataFrame
-        Particles, measured or true, in channel coordinates: `frame`, `y_um`, `z_um` (see `Film.to_channel`).
+        Particles, measured or true, in channel coordinates: `frame`, `y_channel_um`, `z_um` (see `Film.to_channel`).
     frames : array (n,)
         Frames to report, increasing, with or without particles; others are ignored.
     channel : Channel
@@ -30,9 +30,9 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
     ValueError
         If a column is missing or the frames do not increase.
     """
-    missing = {"frame", "y_um", "z_um"} - set(table)
+    missing = {"frame", "y_channel_um", "z_um"} - set(table)
     if missing:
-        raise ValueError(f"table: got no column {sorted(missing)}, needed are frame, y_um and z_um")
+        raise ValueError(f"table: got no column {sorted(missing)}, needed are frame, y_channel_um and z_um")
     frames = np.asarray(frames)
     if frames.ndim != 1 or (np.diff(frames) <= 0).any():
         raise ValueError(f"frames: got {frames}, allowed are increasing numbers")
@@ -50,7 +50,7 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
 
 def in_middle_third(table: pd.DataFrame, of: str, channel: Channel) -> NDArray[np.bool_]:
     """Tell which particles (n,) of a table in channel coordinates have |z| ≤ h/6 (of 'h') or |y| ≤ w/6 (of 'w')."""
-    column, size_um = {"h": ("z_um", channel.height_um), "w": ("y_um", channel.width_um)}[of]
+    column, size_um = {"h": ("z_um", channel.height_um), "w": ("y_channel_um", channel.width_um)}[of]
     return np.abs(table[column].to_numpy()) <= size_um / 6
 
 

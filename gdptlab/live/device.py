@@ -64,10 +64,10 @@ class Switched(Trajectories):
         on_s = np.minimum(t, self.off_s)
         table = super().table(on_s, border_um=np.inf)
         drifting = (t - on_s)[table["frame"]]
-        speed = self.focusing.channel.velocity(table["y_um"], table["z_um"])
-        table["x_um"] += speed * drifting
+        speed = self.focusing.channel.velocity(table["y_channel_um"], table["z_um"])
+        table["x_channel_um"] += speed * drifting
         table["t_s"] = t[table["frame"]]
-        seen = table["x_um"].between(-border_um, self.view_length_um + border_um)
+        seen = table["x_channel_um"].between(-border_um, self.view_length_um + border_um)
         return table[seen].reset_index(drop=True)
 
 

@@ -104,8 +104,7 @@ class MiddleThird:
         'h' (|z| ≤ h/6) or 'w' (|y| ≤ w/6), as in `experiment.fractions`.
     channel : Channel
     to_channel : callable
-        Table of an evaluator -> the same with `y_um` and `z_um`, measured from the channel's middle; for example
-        `Film.to_channel`.
+        Table of an evaluator -> the same with `y_channel_um` and `z_um`; for example `Film.to_channel`.
 
     Raises
     ------

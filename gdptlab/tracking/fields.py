@@ -145,5 +145,7 @@ def mean_squared_displacement(tracks: pd.DataFrame, frame_rate_hz: float, *, lon
     found = trackpy.emsd(
         tracks, 1.0, rate, max_lagtime=whole("longest", longest, 1, 10**6), detail=True, pos_columns=columns
     )
-    made = {"lag_s": found["lagt"]} | {f"msd_{column}2": found[f"<{column}^2>"] for column in columns}
+    made = {"lag_s": found["lagt"]} | {
+        f"msd_{column[0]}_{column.rpartition('_')[2]}2": found[f"<{column}^2>"] for column in columns
+    }
     return pd.DataFrame(made | {"n": found["N"]}).reset_index(drop=True)
