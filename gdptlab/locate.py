@@ -31,6 +31,7 @@ from tqdm.auto import tqdm
 
 from gdptlab._checks import choice, flag, image_array, positive, whole
 from gdptlab._compiled import on_one_core
+from gdptlab._workers import leave_with_parent
 from gdptlab.calibration import Calibration, checked
 from gdptlab.correlation import peaks, standardised, strongest, vertex
 
@@ -335,7 +336,8 @@ def in_blocks(
         return
     jobs = (delayed(_located)(block, first, calibration, settings) for first, block in _blocks(frames, done))
     # What joblib puts into shared memory stays there until the last frame: of a long film too much.
-    for first, n, table in Parallel(n_jobs, return_as="generator", pre_dispatch="n_jobs + 1", max_nbytes=None)(jobs):
+    how = {"pre_dispatch": "n_jobs + 1", "max_nbytes": None, "initializer": leave_with_parent}
+    for first, n, table in Parallel(n_jobs, return_as="generator", **how)(jobs):
         if isinstance(table, Exception):
             raise table
         yield first, n, table

@@ -28,6 +28,7 @@ from tqdm.auto import tqdm
 from gdptlab._checks import positive, whole
 from gdptlab._files import keep_arrays, kept_arrays, sources_folder
 from gdptlab._versions import versions
+from gdptlab._workers import leave_with_parent
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
 
@@ -177,7 +178,8 @@ def evaluate(
     # This process evaluates the first frame, so that workers get calibrations whose lazy parts are there already.
     parts = [_evaluated(film, todo, frames[:1])]
     blocks = [frames[k : k + FRAMES_PER_JOB] for k in range(1, len(frames), FRAMES_PER_JOB)]
-    jobs = Parallel(n_jobs=n_jobs, return_as="generator")(delayed(_evaluated)(film, todo, block) for block in blocks)
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator", initializer=leave_with_parent)
+    jobs = parallel(delayed(_evaluated)(film, todo, block) for block in blocks)
     with tqdm(total=len(frames), initial=1, desc="frames", unit="frame", leave=False, disable=not progress) as bar:
         for block, part in zip(blocks, jobs, strict=True):
             parts.append(part)
