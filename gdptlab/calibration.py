@@ -5,29 +5,20 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 """
 
 import os
-import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import depths, flag, image_array, whole
+from gdptlab._checks import depths, flag, image_array, instance, whole
 from gdptlab._compiled import on_one_core
-from gdptlab._files import written_whole
 from gdptlab._plans import planned
 from gdptlab.correlation import Correlator, normalised
 from gdptlab.denoising import denoised
 from gdptlab.refinement import Displacement
-
-VERSION = 1
-"""Of the file format of `Calibration.save`."""
-
-PARTS = {"stack": 3, "z_um": 1, "subset": 1, "templates": 3}
-"""Arrays in the file of `Calibration.save`, and how many axes each has."""
 
 LOSSLESS = 0.98
 """Templates that keep this correlation with themselves at half resolution are searched for there."""
@@ -284,7 +275,7 @@ class Calibration:
 
     @cached_property
     def displacement(self) -> Displacement:
-        """What finds the part of a pixel and of a step by which a particle is off a template."""
+        """Finds the part of a pixel and of a slice by which a particle is off a template."""
         return Displacement(self.templates, self.z_um)
 
     def correlator(self, shape: tuple[int, int]) -> Correlator:
@@ -305,20 +296,9 @@ class Calibration:
             If the name does not end in .npz, or the calibration has patterns learned from a whole scan (`learned`):
             the file has no place for them, and without them it would measure otherwise.
         """
-        path = Path(path)
-        if self.learned is not None:
-            raise ValueError("path: got a calibration with `learned` patterns, allowed is one without; learn it again")
-        if path.suffix != ".npz":
-            raise ValueError(f"path: got {path.name!r}, allowed are names that end in .npz")
-        with written_whole(path) as temporary:
-            np.savez_compressed(
-                temporary,
-                gdptlab_calibration=VERSION,
-                stack=self.stack,
-                z_um=self.z_um,
-                subset=self.subset,
-                templates=self.templates,
-            )
+        from gdptlab.pipeline.calibration_file import write
+
+        write(self, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Self:
@@ -331,57 +311,9 @@ class Calibration:
         ValueError
             If it is damaged, of another version, or no calibration.
         """
-        name = Path(path).name
-        try:
-            with zipfile.ZipFile(path) as archive:
-                shapes = {part.removesuffix(".npy"): _shape(archive, part) for part in archive.namelist()}
-                _must_fit(shapes, {part.filename: part.file_size for part in archive.infolist()})
-            with np.load(path, allow_pickle=False) as file:
-                version = file["gdptlab_calibration"]
-                if not np.array_equal(version, VERSION):
-                    raise ValueError(f"it is of version {version}, allowed is version {VERSION}")
-                data = {part: file[part] for part in PARTS}
-            _must_be_sound(data)
-        except FileNotFoundError:
-            raise
-        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ValueError(f"path: got {name!r}, which cannot be read as a calibration: {error}") from error
-        return cls(**data)
+        from gdptlab.pipeline.calibration_file import read
 
-
-def _shape(archive: zipfile.ZipFile, part: str) -> tuple[int, ...]:
-    """Shape of an array in a file of numpy's, from its header alone."""
-    with archive.open(part) as opened:
-        major = np.lib.format.read_magic(opened)[0]
-        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-        return read(opened)[0]
-
-
-def _must_fit(shapes: dict[str, tuple[int, ...]], sizes: dict[str, int]) -> None:
-    """Raise ValueError unless the arrays of a file, by their shapes, are those of a calibration and fit each other."""
-    if set(shapes) != {"gdptlab_calibration", *PARTS}:
-        raise ValueError(f"it holds {', '.join(shapes)}, needed are gdptlab_calibration, {', '.join(PARTS)}")
-    stack, images = shapes["stack"], len(shapes["z_um"]) and shapes["z_um"][0]
-    square = len(stack) == 3 and stack[0] == images >= 3 and stack[1] == stack[2] and stack[1] % 2 == 1
-    subset = len(shapes["subset"]) == 1 and 2 <= shapes["subset"][0] <= images
-    if not (square and subset and len(shapes["z_um"]) == 1 and shapes["templates"] == stack):
-        raise ValueError(f"its arrays have shapes that do not fit each other: {shapes}")
-    if max(sizes.values()) > 16 * np.prod(stack) + 1000:
-        raise ValueError(f"its arrays have more bytes than shapes: {sizes}")
-
-
-def _must_be_sound(data: dict[str, NDArray]) -> None:
-    """Raise ValueError unless arrays that fit each other are what `from_stack` would make of them."""
-    for part in PARTS:
-        if data[part].dtype.kind != ("i" if part == "subset" else "f") or not np.isfinite(data[part]).all():
-            raise ValueError(f"{part} holds what is not finite or not of its type, {data[part].dtype}")
-    if not (np.diff(data["z_um"]) > 0).all():
-        raise ValueError("z_um does not increase")
-    subset = data["subset"]
-    if subset.min() < 0 or subset.max() >= len(data["stack"]) or not (np.diff(subset) > 0).all():
-        raise ValueError(f"subset does not name images in increasing order: {subset}")
-    if np.abs(np.linalg.norm(data["templates"], axis=(1, 2)) - 1).max() > 1e-3:
-        raise ValueError("templates do not have norm 1")
+        return cls(**read(path))
 
 
 def _correlator(calibration: Calibration, shape: tuple[int, int]) -> Correlator:
@@ -397,9 +329,7 @@ def checked(calibration: object) -> Calibration:
     TypeError
         If not.
     """
-    if isinstance(calibration, Calibration):
-        return calibration
-    raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration")
+    return instance("calibration", calibration, Calibration)
 
 
 def _middles(n: int, n_sub: int) -> NDArray[np.int64]:

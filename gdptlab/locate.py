@@ -9,7 +9,7 @@ By correlation (the paper's section 2):
 4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, since noise lowers
    the whole profile and Pearson's correlation does not depend on its level. A parabola through the best three gives z
    between slices.
-5. Refinement: the window of the candidate is correlated with templates from the guess onward, uphill along z until C_m
+5. Refinement: the window of the candidate is correlated with templates from that slice onward, uphill along z until C_m
    no longer rises. Between pixels and slices, x, y and z follow from least squares in that window (`refinement`).
 6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
 
@@ -29,7 +29,7 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from gdptlab._checks import choice, flag, image_array, positive, whole
+from gdptlab._checks import choice, flag, image_array, iterable, positive, processes
 from gdptlab._compiled import on_one_core
 from gdptlab._workers import leave_with_parent
 from gdptlab.calibration import Calibration, checked
@@ -282,10 +282,7 @@ def batch(
         raise ValueError(
             f"frames: got one of shape {frames.shape}, allowed is a film of them; `locate` measures one frame"
         )
-    try:
-        iter(frames)
-    except TypeError as error:
-        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+    iterable("frames", frames)
     tables = [blank]
     total = len(frames) if hasattr(frames, "__len__") else None
     with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
@@ -301,8 +298,7 @@ def blank_table(calibration: Calibration, n_jobs: int, settings: dict[str, objec
     What is wrong with the settings is refused before the film begins, and what a calibration makes only when it
     is needed is made here, not by every process for every block.
     """
-    if n_jobs != -1:
-        whole("n_jobs", n_jobs, 1, 10_000)
+    n_jobs = processes("n_jobs", n_jobs)
     blank = locate(np.zeros((checked(calibration).size,) * 2), calibration, **settings)
     if settings.get("method") == "joint" and n_jobs != 1:
         raise ValueError(f"n_jobs: got {n_jobs}, allowed with method 'joint' is 1: a frame begins with the last")

@@ -12,7 +12,6 @@ have closed forms, and only x needs a quadrature.
 
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from numbers import Integral
 from typing import Any, Self
 
 import numpy as np
@@ -20,7 +19,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PPoly
 
-from gdptlab._checks import choice, positive
+from gdptlab._checks import choice, generator, instance, numbers, positive
 
 TERMS = 100
 """Number of terms of the Poiseuille series. Chosen on the paper's channel: the error is 2e-6 of the peak speed on a
@@ -28,6 +27,9 @@ wall and 3e-12 one particle radius off it; with 10 terms, 5e-4 and 6e-5. More te
 
 IN_CHANNEL = {"x": "x_channel_um", "y": "y_channel_um", "z": "z_um"}
 """Columns of a position in the channel, by axis."""
+
+MOST_PARTICLES = 1e7
+"""Largest number of particles that are drawn. Chosen: their paths take some gigabytes; the paper's film has 100."""
 
 KNOTS = 10
 """Number of knots of the path integral in one focusing time. Chosen on 20 s in the paper's channel: the error is
@@ -41,19 +43,17 @@ def _positive_fields(obj: Any) -> None:
             object.__setattr__(obj, item.name, positive(item.name, getattr(obj, item.name)))
 
 
-def _instance(name: str, value: Any, kind: type) -> None:
-    """Refuse a value that is not of this class."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{name}: got {value!r}, allowed is a {kind.__name__}")
-
-
 def _within(name: str, value: ArrayLike, limit: float) -> NDArray[np.float64]:
     """Return `value` as an array of its shape if all of it, but for rounding, lies within ± `limit` µm."""
-    array = np.asarray(value, dtype=float)
-    outside = ~(np.abs(array) <= limit * (1 + 1e-12))  # in this form NaN is outside
-    if outside.any():
-        raise ValueError(f"{name}: got {array[outside].flat[0]}, allowed is -{limit:g} to {limit:g} µm")
-    return np.clip(array, -limit, limit)
+    return np.clip(numbers(name, value, -limit * (1 + 1e-12), limit * (1 + 1e-12)), -limit, limit)
+
+
+def _must_fit(name: str, array: NDArray, other: NDArray) -> None:
+    """Raise ValueError unless two arrays can be broadcast together."""
+    try:
+        np.broadcast_shapes(array.shape, other.shape)
+    except ValueError as error:
+        raise ValueError(f"{name}: got shape {array.shape}, allowed is one that fits {other.shape}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +105,7 @@ class Channel:
         """
         along = _within("y_channel_um", y_channel_um, self.width_um / 2)
         across = _within("z_um", z_um, self.height_um / 2)
+        _must_fit("z_um", across, along)
         long, short = self.width_um, self.height_um
         if long < short:
             along, across, long, short = across, along, short, long
@@ -182,7 +183,7 @@ class Acoustics:
 
     def __post_init__(self) -> None:
         _positive_fields(self)
-        _instance("two_half_waves", self.two_half_waves, bool)
+        instance("two_half_waves", self.two_half_waves, bool)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,7 +207,7 @@ class Focusing:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            _instance(item.name, getattr(self, item.name), item.type)
+            instance(item.name, getattr(self, item.name), item.type)
         side, radius = min(self.channel.width_um, self.channel.height_um), self.suspension.radius_um
         if 2 * radius >= side:
             raise ValueError(f"radius_um: got {radius:g}, allowed is below {side / 2:g}, half the channel")
@@ -249,8 +250,9 @@ class Focusing:
         Solves dy/dt = -U sin(2πy/w): tan(πy/w) = tan(πy_0/w) exp(-2πUt/w).
         """
         extent = self.extent_um(axis)
-        start = np.tan(np.pi / extent * _within("start_um", start_um, extent / 2))
-        return extent / np.pi * np.arctan(start * np.exp(-np.asarray(t_s) / self.focusing_time_s(axis)))
+        start, t = np.tan(np.pi / extent * _within("start_um", start_um, extent / 2)), numbers("t_s", t_s, 0)
+        _must_fit("t_s", t, start)
+        return extent / np.pi * np.arctan(start * np.exp(-t / self.focusing_time_s(axis)))
 
     def arrival_time(self, axis: str, start_um: ArrayLike) -> NDArray[np.float64]:
         """Return the time in s to reach the middle third from `start_um`: 0 inside it, inf from the wall itself."""
@@ -336,8 +338,8 @@ class Trajectories:
 
     def __post_init__(self) -> None:
         _positive_fields(self)
-        _instance("focusing", self.focusing, Focusing)
-        _instance("start", self.start, pd.DataFrame)
+        instance("focusing", self.focusing, Focusing)
+        instance("start", self.start, pd.DataFrame)
         columns = ["particle", *IN_CHANNEL.values()]
         if not set(columns) <= set(self.start.columns):
             raise ValueError(f"start: got columns {list(self.start.columns)}, allowed are {columns}")
@@ -384,21 +386,20 @@ class Trajectories:
         TypeError, ValueError
             If an argument is out of range, or `mean_in_view` so small that there would be no particle.
         """
-        _instance("focusing", focusing, Focusing)
-        if isinstance(rng, bool) or not isinstance(rng, Integral | np.random.Generator):
-            raise TypeError(f"rng: got {rng!r}, allowed is an integer seed or a numpy Generator")
-        if isinstance(rng, Integral) and rng < 0:
-            raise ValueError(f"rng: got {rng!r}, allowed is a seed of at least 0")
+        instance("focusing", focusing, Focusing)
+        rng = generator("rng", rng)
         border, view = positive("border_um", border_um, zero=True), positive("view_length_um", view_length_um)
         density = positive("mean_in_view", mean_in_view) / view
         drift = focusing.channel.max_speed_um_s * positive("duration_s", duration_s)
+        if not density * (view + 2 * border + drift) < MOST_PARTICLES:
+            raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed are {MOST_PARTICLES:g} particles in all")
         # Stretches from the downstream end: the view with its borders, then as many views as the drift needs.
         ends = view + 2 * border + view * np.arange(1 + np.ceil(drift / view))
         starts, counts = np.concatenate([[0.0], ends[:-1]]), np.diff(np.rint(density * ends), prepend=0).astype(int)
-        generator, half = np.random.default_rng(rng), [focusing.free_um("y"), focusing.free_um("z")]
+        half = [focusing.free_um("y"), focusing.free_um("z")]
         xyz = np.concatenate(
             [
-                generator.uniform([view + border - b, -half[0], -half[1]], [view + border - a, *half], size=(n, 3))
+                rng.uniform([view + border - b, -half[0], -half[1]], [view + border - a, *half], size=(n, 3))
                 for a, b, n in zip(starts, ends, counts, strict=True)
             ]
         )
@@ -449,9 +450,9 @@ class Trajectories:
         ValueError
             If a time or the border is out of range.
         """
-        t = np.asarray(times_s, dtype=float)
-        if t.ndim != 1 or not np.all((t >= 0) & (t <= self.duration_s)):
-            raise ValueError(f"times_s: got {times_s!r}, allowed are one axis, 0 to {self.duration_s:g} s")
+        t = numbers("times_s", times_s, 0, self.duration_s)
+        if t.ndim != 1:
+            raise ValueError(f"times_s: got shape {t.shape}, allowed is one axis")
         border = border_um if border_um == np.inf else positive("border_um", border_um, zero=True)
         x = self.start["x_channel_um"].to_numpy() + self._drift(t)
         y, z = self._across(t)

@@ -99,14 +99,14 @@ def one_track(track: pd.DataFrame, path: pd.DataFrame, frame_rate_hz: float) -> 
     return figure
 
 
-def _binned(axes: Axes, place: NDArray, value: NDArray, edges: NDArray, colour: str, marker: str, label: str) -> None:
+def _binned(axes: Axes, at: NDArray, value: NDArray, edges: NDArray, colour: str, marker: str, label: str) -> None:
     """Median and quartiles of a velocity in bins of position."""
-    groups = pd.Series(value).groupby(pd.cut(pd.Series(place), edges), observed=False)
+    groups = pd.Series(value).groupby(pd.cut(pd.Series(at), edges), observed=False)
     low, middle, high = (groups.quantile(q).to_numpy() for q in (0.25, 0.5, 0.75))
     bars = np.stack([middle - low, high - middle])
-    at = (edges[1:] + edges[:-1]) / 2
+    middles = (edges[1:] + edges[:-1]) / 2
     axes.errorbar(
-        at, middle, yerr=bars, color=colour, marker=marker, ls="", lw=1, capsize=2, ms=5, label=label, zorder=3
+        middles, middle, yerr=bars, color=colour, marker=marker, ls="", lw=1, capsize=2, ms=5, label=label, zorder=3
     )
 
 
@@ -141,16 +141,16 @@ def velocity_profiles(table: pd.DataFrame, focusing: Focusing) -> Figure:
         _binned(axes[0, 0], part["y_channel_um"], part["vx_um_s"], edges, COLOURS[k], "os"[k], label)
     axes[0, 0].set(xlabel="y (µm)", ylabel="$v_x$ (µm/s)", title="flow: bands, Poiseuille", ylim=(0, None))
     axes[0, 0].legend(fontsize="small", loc="lower center")
-    for panel, axis, place in zip(axes[0, 1:], "yz", (y, z), strict=True):
+    for panel, axis, position in zip(axes[0, 1:], "yz", (y, z), strict=True):
         seen = table[f"v{axis}_um_s"]
         panel.plot(table[IN_CHANNEL[axis]], seen, ".", color="0.7", ms=1, rasterized=True)
         panel.plot(
-            place,
-            focusing.radiation_velocity(axis, place),
+            position,
+            focusing.radiation_velocity(axis, position),
             color="black",
             label="eq. (1a)" if axis == "y" else "eq. (1b)",
         )
-        edges = np.linspace(place[0], place[-1], BINS + 1)
+        edges = np.linspace(position[0], position[-1], BINS + 1)
         _binned(panel, table[IN_CHANNEL[axis]], seen, edges, COLOURS[1], "o", "measured")
         top = 1.6 * focusing.amplitude_um_s(axis)
         panel.set(xlabel=f"{axis} (µm)", ylabel=f"$v_{axis}$ (µm/s)", title=f"sound along {axis}", ylim=(-top, top))
@@ -205,9 +205,9 @@ def collapsed_paths(
     t_s = tracks["frame"] / frame_rate_hz
     for panel, axis, amplitude in zip(axes[0], "yz", amplitudes_um_s, strict=True):
         extent = focusing.extent_um(axis)
-        place = tracks[IN_CHANNEL[axis]].abs()
-        seen = place.between(0.05 * extent, 0.45 * extent)  # elsewhere noise is all there is
-        table = pd.DataFrame({"t": t_s, "v": np.log(np.tan(np.pi * place / extent)), "p": tracks["particle"]})[seen]
+        position = tracks[IN_CHANNEL[axis]].abs()
+        seen = position.between(0.05 * extent, 0.45 * extent)  # elsewhere noise is all there is
+        table = pd.DataFrame({"t": t_s, "v": np.log(np.tan(np.pi * position / extent)), "p": tracks["particle"]})[seen]
         slope = -2 * np.pi * amplitude / extent
         table["v"] -= (table["v"] - slope * table["t"]).groupby(table["p"]).transform("median")
         panel.plot(table["t"], table["v"], ".", color=COLOURS[0], ms=1.2, alpha=0.5, rasterized=True, label="tracks")

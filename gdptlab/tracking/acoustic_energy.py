@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial import KDTree
 
-from gdptlab._checks import positive
+from gdptlab._checks import generator, instance, instances, positive
 from gdptlab._checks import table as check_table
 from gdptlab.experiment.channel import IN_CHANNEL, Focusing
 from gdptlab.experiment.film import Film
-from gdptlab.tracking.tracks import identify
+from gdptlab.tracking.tracks import frames_of, identify
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t. Convention of robust fits: at 5 standard deviations a residual weighs a sixth of
@@ -99,8 +99,7 @@ def fit_energy(
     """
     columns = ["frame", "particle", "y_channel_um", "y_std_um", "z_um", "z_std_um"]
     check_table("tracks", tracks, columns)
-    if not isinstance(focusing, Focusing):
-        raise TypeError(f"focusing: got {focusing!r}, allowed is a Focusing")
+    instance("focusing", focusing, Focusing)
     rate = positive("frame_rate_hz", frame_rate_hz)
     if not 0 < positive("confidence", confidence) < 1:
         raise ValueError(f"confidence: got {confidence}, allowed is between 0 and 1")
@@ -224,8 +223,9 @@ def imitate(
     """
     stds = [f"{axis}_std_um" for axis in "xyz"]
     check_table("tracks", tracks, ["frame", "particle", "x_px", "y_px", *POSITION, *stds])
-    rng = np.random.default_rng(rng)
-    here, start = _paths(film)
+    frames_of("tracks", tracks)
+    rng = generator("rng", rng)
+    here, start = _paths(instance("film", film, Film))
     who = pd.Series(identify(tracks, film.truth()))
     owner = who.groupby(tracks["particle"].to_numpy()).agg(lambda part: part.mode().iloc[0])
     lent = tracks.rename(columns={"particle": "track"})[["frame", "track", *POSITION, *stds]]
@@ -235,8 +235,10 @@ def imitate(
     for name in POSITION:
         lent[name] -= lent.pop(f"{name}_true")
     start = start.loc[np.unique(lent["lender"])]
+    if start.empty:
+        raise ValueError("tracks: got none of a particle of the film, needed is one or more")
     tree = KDTree(start)
-    for other in others:
+    for other in instances("others", others, Film):
         there, borrowers = _paths(other)
         near = tree.query(borrowers, k=3)[1]
         chosen = start.index.to_numpy()[rng.permuted(near, axis=1)[:, 0]]

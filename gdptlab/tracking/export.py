@@ -9,7 +9,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab._checks import positive
+from gdptlab._checks import flag, positive
+from gdptlab._checks import path as check_path
 from gdptlab._checks import table as check_table
 from gdptlab._files import written_whole
 from gdptlab.tracking.tracks import IN_CHANNEL, IN_UM, frames_of, positions_of
@@ -124,7 +125,7 @@ def napari_tracks(
     TypeError, ValueError
         If `tracks` is no table, or a column is missing.
     """
-    axes = ["particle", "frame", *(_position_um(tracks)[::-1] if in_um else ["y_px", "x_px"])]
+    axes = ["particle", "frame", *(_position_um(tracks)[::-1] if flag("in_um", in_um) else ["y_px", "x_px"])]
     ordered = check_table("tracks", tracks, axes).sort_values(["particle", "frame"])
     others = [name for name in ordered if name not in axes and ordered[name].dtype.kind in "buif"]
     features = {name: ordered[name].to_numpy(dtype=float) for name in others}
@@ -141,13 +142,10 @@ def _position_um(tracks: pd.DataFrame) -> list[str]:
 
 def _path(path: str | os.PathLike[str], suffix: str) -> Path:
     """Path of a file, if it has this suffix."""
-    if not isinstance(path, str | os.PathLike):
-        raise TypeError(f"path: got a {type(path).__name__}, allowed is the path of a file")
-    if Path(path).suffix != suffix:
-        raise ValueError(f"path: got {Path(path).name!r}, allowed are names that end in {suffix}")
-    if not Path(path).parent.is_dir():
+    path = check_path("path", path, suffix)
+    if not path.parent.is_dir():
         raise FileNotFoundError(f"path: got {str(path)!r}, allowed is one in a folder that exists")
-    return Path(path)
+    return path
 
 
 def _vtk_file(kind: str, **attributes: str) -> tuple[Element, Element]:

@@ -298,7 +298,10 @@ def _slopes(
     enough = number >= LEAST_ROWS
     normal = np.moveaxis(moments[np.add.outer(range(3), range(3))], (0, 1), (-2, -1))[enough]
     right = np.moveaxis(right, 0, -1)[enough]
-    inverse = np.linalg.inv(normal)
+    try:
+        inverse = np.linalg.inv(normal)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("tracks: got times in which no velocity can be told, allowed are those that differ") from error
     fitted = np.einsum("naij,naj->nai", inverse, right)
     chi2 = squares[enough] - (fitted * right).sum(axis=-1)
     excess = np.maximum(chi2 / (number[enough] - 3)[:, None], least)
