@@ -150,9 +150,9 @@ def table(name: str, value: Any, columns: Iterable[str]) -> pd.DataFrame:
     if not isinstance(value, pd.DataFrame):
         raise TypeError(f"{name}: got a {type(value).__name__}, allowed is a DataFrame")
     columns = list(columns)
-    missing = sorted(set(columns) - set(value))
+    missing = sorted(set(columns) - set(value), key=str)
     if missing:
-        raise ValueError(f"{name}: got no column {missing}, needed are {', '.join(columns)}")
+        raise ValueError(f"{name}: got no column {missing}, needed are {', '.join(map(str, columns))}")
     for column in [*columns, *({"frame"} & set(value))]:
         if value[column].dtype.kind not in "buif":
             raise TypeError(f"{name}: got {column} of type {value[column].dtype}, allowed are real numbers")

@@ -285,7 +285,7 @@ def batch(
     iterable("frames", frames)
     tables = [blank]
     total = len(frames) if hasattr(frames, "__len__") else None
-    with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
+    with tqdm(total=total, desc="frames", unit="frame", disable=not flag("progress", progress)) as bar:
         for _, n, table in in_blocks(frames, calibration, n_jobs, settings):
             tables.append(table)
             bar.update(n)

@@ -315,7 +315,9 @@ def spoilt(draw, value):
         array = np.array(value)
         if array.dtype.kind in "fiu":
             return draw(st.sampled_from(spoilt_arrays(array.astype(float))) | arrays())
-    return draw(st.sampled_from([odd for odd in ODD if not (callable(odd) and callable(value))]))
+    return draw(
+        st.sampled_from([odd for odd in ODD if not (callable(odd) and (callable(value) or isinstance(value, str)))])
+    )
 
 
 TABLES = ("absent", "nan", "inf", "huge", "text", "object", "bool", "complex", "negative", "empty", "twice", "labels")

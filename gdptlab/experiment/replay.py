@@ -171,7 +171,8 @@ def evaluate(
     n_jobs = processes("n_jobs", n_jobs)
     methods = instances("methods", methods, Method)
     frames = evaluated_frames(film, every)
-    folder = sources_folder("replay") if cache else None
+    flag("progress", progress)
+    folder = sources_folder("replay") if flag("cache", cache) else None
     paths = [folder / _cache_name(film, method, frames) if folder else None for method in methods]
     # `joblib.Memory` would keep the result of one call; here one pass over the film serves all missing tables.
     tables = [kept_arrays(path) if path else None for path in paths]
@@ -273,7 +274,7 @@ def durations(film: Film, methods: Sequence[Method], *, count: int = 20, progres
     for method in methods:
         method(film[frames[0]])
     rows = []
-    for frame in tqdm(frames, desc="timed", unit="frame", leave=False, disable=not progress):
+    for frame in tqdm(frames, desc="timed", unit="frame", leave=False, disable=not flag("progress", progress)):
         image = film[frame]
         for method in methods:
             start = time.perf_counter()
@@ -324,13 +325,13 @@ def sweep(
     if not films or not methods:
         raise ValueError(f"films, methods: got {len(films)} and {len(methods)}, allowed are one or more")
     parts = []
-    for film in tqdm(films, desc="films", unit="film", disable=not progress):
+    for film in tqdm(films, desc="films", unit="film", disable=not flag("progress", progress)):
         channel, frames = film.trajectories.focusing.channel, evaluated_frames(film, every)
         truth = fractions(film.to_channel(film.truth()), np.arange(len(film)), channel).drop(columns="frame")
         triggers = {f"true_{a}_s": trigger_time(film.times_s, truth[f"fraction_{a}"], level) for a in "hw"}
         seen = truth.iloc[frames].add_prefix("true_").reset_index(drop=True)
         name = {"seed": film.seed, "image_type": film.image_type}
-        bar = flag("progress", progress) and len(films) == 1  # one bar is enough
+        bar = progress and len(films) == 1  # one bar is enough
         tables = evaluate(film, methods, every=every, n_jobs=n_jobs, cache=cache, progress=bar)
         for method, table in zip(methods, tables, strict=True):
             monitor = fractions(film.to_channel(table), frames, channel)

@@ -381,4 +381,6 @@ def timed(films: Iterable[Film], timers_s: ArrayLike, of: str = "w") -> pd.DataF
         energy = film.trajectories.focusing.acoustics.energy_density_J_m3
         table = true_fractions(film, timers_s).rename(columns={"t_s": "off_s", f"fraction_{of}": "true_fraction"})
         parts.append(table[["off_s", "true_fraction"]].assign(seed=film.seed, energy_density_J_m3=energy))
+    if not parts:
+        raise ValueError("films: got none, allowed are one or more")
     return pd.concat(parts, ignore_index=True)
