@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import LARGEST, number, positive, real_array
+from gdptlab._checks import LARGEST, function, generator, iterable, number, positive, real_array
 from gdptlab._checks import table as check_table
 
 RESAMPLES = 1000
@@ -228,14 +228,15 @@ def standard_assessment(
     TypeError, ValueError
         If an argument is not of that form, or there are fewer than two frames.
     """
-    if not callable(locator):
-        raise TypeError(f"locator: got {locator!r}, allowed is a function that takes a frame and returns a table")
+    function("locator", locator)
     check_table("true", true, ["frame", *AXES.values()])
     if not 0 < number("confidence", confidence) < 1:
         raise ValueError(f"confidence: got {confidence}, allowed is above 0 and below 1")
     tables, allowed = [], {"within_px": within_px, "within_um": within_um}
-    for k, frame in enumerate(frames):
-        measured, here = locator(frame), true[true["frame"] == k].drop(columns="frame")
+    rng = generator("rng", rng)
+    for k, frame in enumerate(iterable("frames", frames)):
+        measured = check_table("locator", locator(frame), AXES.values())
+        here = true[true["frame"] == k].drop(columns="frame")
         measured = measured.drop(columns="frame", errors="ignore")
         if edges_um is None:
             tables.append(scores(measured, here, **allowed).to_frame().T)
@@ -244,7 +245,7 @@ def standard_assessment(
     if len(tables) < 2:
         raise ValueError(f"frames: got {len(tables)}, allowed are two or more")
     sums = np.stack([_sums(table) for table in tables])
-    drawn = np.random.default_rng(rng).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
+    drawn = rng.multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
     best, again = _from_sums(sums.sum(axis=0)), _from_sums(np.einsum("rf,fbs->rbs", drawn, sums))
     tail = (1 - confidence) / 2
     columns = {}

@@ -5,36 +5,21 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 """
 
 import os
-import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, depths, flag, image_array, positive, whole
+from gdptlab._checks import choice, depths, flag, image_array, instance, positive, whole
 from gdptlab._compiled import on_one_core
-from gdptlab._files import written_whole
 from gdptlab._plans import planned
 from gdptlab.correlation import Correlator, normalised
 from gdptlab.denoising import denoised
 from gdptlab.preparation import Preparation, preparation
 from gdptlab.refinement import Displacement
-
-VERSION = 1
-"""Of the file format of `Calibration.save`."""
-
-PARTS = {"stack": 3, "z_um": 1, "subset": 1, "templates": 3}
-"""Arrays in the file of `Calibration.save`, and how many axes each has."""
-
-EXTRAS = {"depth_factor": 0, "dark": 2, "flat": 2}
-"""Arrays that the file holds only if there is something to say, and how many axes each has."""
-
-MOST_PIXELS = 10**9
-"""Largest number of pixels of a dark or flat image in a file. Derived: cameras have a tenth, memory holds ten times."""
 
 SIDES = ("near", "far")
 """Sides of focus: depths smaller, and larger, than that of the sharpest image."""
@@ -407,7 +392,7 @@ class Calibration:
 
     @cached_property
     def displacement(self) -> Displacement:
-        """What finds the part of a pixel and of a step by which a particle is off a template."""
+        """Finds the part of a pixel and of a slice by which a particle is off a template."""
         return Displacement(self.templates, self.z_um)
 
     def correlator(self, shape: tuple[int, int]) -> Correlator:
@@ -428,19 +413,9 @@ class Calibration:
             If the name does not end in .npz, or the calibration has patterns learned from a whole scan (`learned`):
             the file has no place for them, and without them it would measure otherwise.
         """
-        path = Path(path)
-        if self.learned is not None:
-            raise ValueError("path: got a calibration with `learned` patterns, allowed is one without; learn it again")
-        if path.suffix != ".npz":
-            raise ValueError(f"path: got {path.name!r}, allowed are names that end in .npz")
-        parts = {part: getattr(self, part) for part in PARTS} | {"gdptlab_calibration": VERSION}
-        if self.depth_factor != 1:
-            parts["depth_factor"] = np.float64(self.depth_factor)
-        if self.camera is not None:
-            images = {"dark": self.camera.dark, "flat": self.camera.flat}
-            parts |= {name: image for name, image in images.items() if image is not None}
-        with written_whole(path) as temporary:
-            np.savez_compressed(temporary, **parts)
+        from gdptlab.pipeline.calibration_file import write
+
+        write(self, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Self:
@@ -453,73 +428,9 @@ class Calibration:
         ValueError
             If it is damaged, of another version, or no calibration.
         """
-        name = Path(path).name
-        try:
-            with zipfile.ZipFile(path) as archive:
-                shapes = {part.removesuffix(".npy"): _shape(archive, part) for part in archive.namelist()}
-                _must_fit(shapes, {part.filename: part.file_size for part in archive.infolist()})
-            with np.load(path, allow_pickle=False) as file:
-                version = file["gdptlab_calibration"]
-                if not np.array_equal(version, VERSION):
-                    raise ValueError(f"it is of version {version}, allowed is version {VERSION}")
-                data = {part: file[part] for part in PARTS}
-                extras = {part: file[part] for part in EXTRAS if part in file}
-            _must_be_sound(data)
-            factor, camera = _sound_extras(extras)
-        except FileNotFoundError:
-            raise
-        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ValueError(f"path: got {name!r}, which cannot be read as a calibration: {error}") from error
-        return cls(**data, depth_factor=factor, camera=camera)
+        from gdptlab.pipeline.calibration_file import read
 
-
-def _sound_extras(extras: dict[str, NDArray]) -> tuple[float, Preparation | None]:
-    """Depth factor and camera of a file, or ValueError if they are not sound."""
-    for part, values in extras.items():
-        if values.dtype.kind != "f" or values.ndim != EXTRAS[part] or not np.isfinite(values).all():
-            raise ValueError(f"{part} holds what is not finite or not of its type, {values.dtype}")
-    factor = float(extras.pop("depth_factor", 1.0))
-    if not 0.1 <= factor <= 10:
-        raise ValueError(f"depth_factor is {factor:g}, allowed is 0.1 to 10")
-    return factor, Preparation(**extras) if extras else None
-
-
-def _shape(archive: zipfile.ZipFile, part: str) -> tuple[int, ...]:
-    """Shape of an array in a file of numpy's, from its header alone."""
-    with archive.open(part) as opened:
-        major = np.lib.format.read_magic(opened)[0]
-        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-        return read(opened)[0]
-
-
-def _must_fit(shapes: dict[str, tuple[int, ...]], sizes: dict[str, int]) -> None:
-    """Raise ValueError unless the arrays of a file, by their shapes, are those of a calibration and fit each other."""
-    if set(shapes) - set(EXTRAS) != {"gdptlab_calibration", *PARTS}:
-        raise ValueError(f"it holds {', '.join(shapes)}, needed are gdptlab_calibration, {', '.join(PARTS)}")
-    stack, images = shapes["stack"], len(shapes["z_um"]) and shapes["z_um"][0]
-    square = len(stack) == 3 and stack[0] == images >= 3 and stack[1] == stack[2] and stack[1] % 2 == 1
-    subset = len(shapes["subset"]) == 1 and 2 <= shapes["subset"][0] <= images
-    if not (square and subset and len(shapes["z_um"]) == 1 and shapes["templates"] == stack):
-        raise ValueError(f"its arrays have shapes that do not fit each other: {shapes}")
-    images = {f"{part}.npy": int(np.prod(shapes[part])) for part in EXTRAS if part in shapes}
-    if any(sizes[name] > 8 * min(n, MOST_PIXELS) + 1000 for name, n in images.items()):
-        raise ValueError(f"its images have more bytes than shapes, or more than {MOST_PIXELS} pixels: {sizes}")
-    if max(size for name, size in sizes.items() if name not in images) > 16 * np.prod(stack) + 1000:
-        raise ValueError(f"its arrays have more bytes than shapes: {sizes}")
-
-
-def _must_be_sound(data: dict[str, NDArray]) -> None:
-    """Raise ValueError unless arrays that fit each other are what `from_stack` would make of them."""
-    for part in PARTS:
-        if data[part].dtype.kind != ("i" if part == "subset" else "f") or not np.isfinite(data[part]).all():
-            raise ValueError(f"{part} holds what is not finite or not of its type, {data[part].dtype}")
-    if not (np.diff(data["z_um"]) > 0).all():
-        raise ValueError("z_um does not increase")
-    subset = data["subset"]
-    if subset.min() < 0 or subset.max() >= len(data["stack"]) or not (np.diff(subset) > 0).all():
-        raise ValueError(f"subset does not name images in increasing order: {subset}")
-    if np.abs(np.linalg.norm(data["templates"], axis=(1, 2)) - 1).max() > 1e-3:
-        raise ValueError("templates do not have norm 1")
+        return cls(**read(path))
 
 
 def _correlator(calibration: Calibration, shape: tuple[int, int]) -> Correlator:
@@ -535,9 +446,7 @@ def checked(calibration: object) -> Calibration:
     TypeError
         If not.
     """
-    if isinstance(calibration, Calibration):
-        return calibration
-    raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration")
+    return instance("calibration", calibration, Calibration)
 
 
 def _middles(n: int, n_sub: int) -> NDArray[np.int64]:

@@ -40,7 +40,7 @@ from gdptlab.tracking import (
 )
 
 tried = settings(
-    max_examples=2000 if THOROUGH else 60,
+    max_examples=round(2000 * THOROUGH) or 60,
     deadline=None,
     derandomize=not THOROUGH,
     database=None,

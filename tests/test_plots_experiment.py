@@ -58,7 +58,7 @@ def test_figure_4_draws_every_particle_of_the_view_at_each_instant() -> None:
     figure = plots.fig4_acoustophoresis(trajectories, trajectories, {"start": 0, "later": 2.5})
     for panel, t in zip(figure.subfigs[1].get_axes(), (0, 2.5), strict=True):
         here = trajectories.positions(t)
-        np.testing.assert_array_equal(panel.get_lines()[0].get_xydata(), here[["y_um", "z_um"]])
+        np.testing.assert_array_equal(panel.get_lines()[0].get_xydata(), here[["y_channel_um", "z_um"]])
     shown = texts(figure)
     assert all(word in shown for word in ("w = 200 µm", "h = 100 µm", "later: 2.5 s", "x (µm), downstream"))
     assert f"{len(trajectories.start)} paths" in shown

@@ -17,6 +17,7 @@ import tifffile
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gdptlab._checks import number, real_array, whole
+from gdptlab._checks import path as check_path
 from gdptlab.pipeline import readers
 
 SUFFIXES = (".tif", ".tiff")
@@ -203,13 +204,12 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
     >>> frames.shape, frames[1].dtype
     ((3, 512, 512), dtype('uint16'))
     """
-    if not isinstance(path, str | os.PathLike):
-        raise TypeError(f"path: got a {type(path).__name__}, allowed is the path of a file or a folder")
+    path = check_path("path", path)
     chosen = {
         name: None if value is None else whole(name, value, 0, 10_000)
         for name, value in (("channel", channel), ("position", position))
     }
-    paths = _paths(Path(path).absolute())
+    paths = _paths(path.absolute())
     if paths[0].suffix.lower() in readers.PACKAGES:
         return _others(paths[0], chosen["channel"], chosen["position"])
     number, files, locations, frame, um_per_px = {}, [], [], None, None

@@ -12,7 +12,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from gdptlab._checks import flag, positive, whole
+from gdptlab._checks import flag, number, positive, whole
+from gdptlab._checks import path as check_path
 from gdptlab._files import keep_arrays, kept_arrays, sources_folder, written_whole
 from gdptlab.calibration import Calibration
 from gdptlab.pipeline.beads import ScanReport
@@ -165,6 +166,7 @@ def measure(
         raise TypeError(f"cells: got {cells!r}, allowed are three whole numbers: along x, y and z")
     cells = tuple(whole("cells", n, 1, 1000) for n in cells)
     scanned, depths = _opened_scan(scan, z_um)
+    z_um = None if z_um is None else [float(z) for z in z_um]
     film = open_images(frames)
     um_per_px = _um_per_px(um_per_px, film, scanned)
     folder = _folder(folder, frames)
@@ -256,6 +258,7 @@ def _opened_scan(scan: str | os.PathLike[str], z_um: tuple[float, float] | None)
         return open_scan(scan)
     if not isinstance(z_um, Sequence | np.ndarray) or len(z_um) != 2:
         raise TypeError(f"z_um: got {z_um!r}, allowed are two numbers: the first and the last depth")
+    z_um = tuple(number("z_um", float(z) if isinstance(z, np.generic) else z) for z in z_um)
     images = open_images(scan)
     if len(images) < 2 or z_um[0] == z_um[1]:
         raise ValueError(f"z_um: got {z_um!r} for {len(images)} images, allowed are two depths for two or more")
@@ -278,7 +281,7 @@ def _folder(folder: str | os.PathLike[str] | None, frames: str | os.PathLike[str
         film = Path(frames).absolute()
         film = film.parent if any(letter in film.name for letter in "*?[") else film
         folder = film.with_name(film.name.split(".")[0] + "_gdptlab")
-    folder = Path(folder)
+    folder = check_path("folder", folder)
     if not folder.parent.is_dir():
         raise FileNotFoundError(f"folder: got {str(folder)!r}, allowed is one in a folder that exists")
     if folder.exists() and not folder.is_dir():

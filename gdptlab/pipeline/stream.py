@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
+from gdptlab._checks import path as check_path
 from gdptlab._checks import real_array
 from gdptlab._files import written_whole
 from gdptlab.calibration import Calibration
@@ -149,9 +150,7 @@ def _comparable(note: dict[str, object]) -> dict[str, object]:
 
 def _claimed(folder: str | os.PathLike[str], note: dict[str, object]) -> Path:
     """Path of the folder, which is new or holds a table that was made as the note says."""
-    if not isinstance(folder, str | os.PathLike):
-        raise TypeError(f"folder: got a {type(folder).__name__}, allowed is the path of a folder")
-    folder, note = Path(folder), json.loads(as_json(note))
+    folder, note = check_path("folder", folder), json.loads(as_json(note))
     if not folder.parent.is_dir():
         raise FileNotFoundError(f"folder: got {str(folder)!r}, allowed is one in a folder that exists")
     if folder.exists() and not folder.is_dir():

@@ -99,7 +99,8 @@ def turn_paths(paths: Trajectories) -> Rotatable:
     Rotatable
     """
     times = paths.duration_s * np.linspace(0, 1, MOMENTS) ** 2  # most of it happens early
-    points = paths.table(times, border_um=np.inf)[["x_um", "y_um", "z_um"]].to_numpy().reshape(len(times), -1, 3)
+    table = paths.table(times, border_um=np.inf)
+    points = table[["x_channel_um", "y_channel_um", "z_um"]].to_numpy().reshape(len(times), -1, 3)
     seen = (points[..., :1] >= 0) & (points[..., :1] <= paths.view_length_um)
     points = np.where(seen, points, np.nan)
     gap = np.full((1, *points.shape[1:]), np.nan)
