@@ -16,15 +16,13 @@ from nbclient import NotebookClient
 from tqdm import tqdm
 
 from gdptlab._files import written_whole
+from gdptlab.pipeline import command
 
 ROOT = Path(__file__).resolve().parents[1]
 """Folder of the checkout."""
 
 COMMANDS = ("run", "sweep", "measure", "report", "-h", "--help")
 """First words of a command line that does not just name notebooks."""
-
-BAD = 3
-"""Exit code after measuring with a calibration that is bad: the results are there, but not to be trusted."""
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
 """Type of the output of a widget, such as a progress bar."""
@@ -127,45 +125,6 @@ def run_notebooks(options: argparse.Namespace, root: Path) -> int:
     return int(failed.any())
 
 
-def measure_images(options: argparse.Namespace) -> int:
-    """Measure a film; give the exit code: 0, or `BAD` if the calibration is bad."""
-    import matplotlib
-
-    from gdptlab.pipeline import measure
-
-    matplotlib.use("Agg")  # pictures go into the page; there may be no screen
-    choices = {name: getattr(options, name) for name in ("method", "threshold", "size", "n_sub")}
-    measured = measure(
-        options.scan,
-        options.frames,
-        options.out,
-        z_um=options.z,
-        um_per_px=options.um_per_px,
-        frame_rate_hz=options.rate,
-        search_range_um=options.search_range,
-        n_jobs=options.jobs,
-        **{name: value for name, value in choices.items() if value is not None},
-    )
-    return _say(measured.folder, measured.quality)
-
-
-def report_folder(options: argparse.Namespace) -> int:
-    """Say what a folder of results holds; give the exit code as `measure_images` does."""
-    path = Path(options.folder) / "quality.csv"
-    if not path.is_file():
-        raise FileNotFoundError(f"folder: got {str(options.folder)!r}, allowed is one that `measure` has finished")
-    print(pd.read_csv(Path(options.folder) / "settings.csv", index_col=0).to_string())
-    return _say(Path(options.folder), pd.read_csv(path, index_col=0, keep_default_na=False))
-
-
-def _say(folder: Path, quality: pd.DataFrame) -> int:
-    """Print the verdicts on a calibration, and where the page is; give the exit code."""
-    for question, row in quality.iterrows():
-        print(f"{row['verdict']:5s} {question}: {row['finding']}. {row['advice']}".rstrip())
-    print(f"results: {folder}\npage:    {folder / 'report.html'}")
-    return BAD if (quality["verdict"] == "bad").any() else 0
-
-
 def _parser() -> argparse.ArgumentParser:
     """Parser of the command line."""
     parser = argparse.ArgumentParser(
@@ -184,48 +143,12 @@ def _parser() -> argparse.ArgumentParser:
         help="write outputs into the notebooks, and figures into figures/ (not figures/mine)",
     )
     add("sweep", help="compute the tables of Figure 5 anew", add_help=False)
-    measures = add(
-        "measure",
-        help="measure your own images",
-        description="Calibrate on a scan of beads, measure a film, and write tables and a page that shows whether to "
-        f"trust them. A run that was stopped goes on where it was. Exit status: 0; {BAD} if the calibration is bad.",
-    )
-    measures.add_argument("scan", help="TIFF, or folder of TIFFs: beads on a slide, one image for each depth")
-    measures.add_argument("frames", help="TIFF, or folder of TIFFs: the film to be measured")
-    measures.add_argument(
-        "--z",
-        nargs=2,
-        type=float,
-        metavar=("FIRST", "LAST"),
-        help="depths of the scan's first and last image, µm; from the file names if not given",
-    )
-    measures.add_argument(
-        "--um-per-px",
-        type=float,
-        metavar="S",
-        help="size of a pixel in the object, µm: the camera's over the magnification; from the files if not given",
-    )
-    measures.add_argument("--out", metavar="FOLDER", help="folder of the results; beside the film if not given")
-    measures.add_argument("--rate", type=float, metavar="HZ", help="frames in a second: then particles are linked")
-    measures.add_argument(
-        "--search-range",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="how far from where it is expected a particle is looked for in the next frame, µm",
-    )
-    measures.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; -1: one for each core")
-    measures.add_argument("--method", help="correlation, or joint for overlapping particles; chosen if not given")
-    measures.add_argument("--threshold", type=float, help="least correlation of a particle; chosen if not given")
-    measures.add_argument("--size", type=int, help="size of a template, px, odd; chosen if not given")
-    measures.add_argument("--n-sub", type=int, help="images of the scan to search with; chosen if not given")
-    reports = add("report", help="say what a folder of results holds", description="Say what `measure` found.")
-    reports.add_argument("folder", help="folder of the results")
+    command.add_to(commands)
     return parser
 
 
 def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
-    """Run the command line; give its exit code: 0; 1 if a notebook failed; `BAD` if a calibration is bad."""
+    """Run the command line; give its exit code: 0; 1 if a notebook failed; `command.BAD` if a calibration is bad."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] not in COMMANDS:
         arguments.insert(0, "run")  # `python -m gdptlab 02 03` runs notebooks
@@ -236,9 +159,7 @@ def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     try:
-        if options.command == "measure":
-            return measure_images(options)
-        return report_folder(options) if options.command == "report" else run_notebooks(options, root)
+        return run_notebooks(options, root) if options.command == "run" else options.do(options)
     except (TypeError, ValueError, FileNotFoundError) as error:
         parser.error(str(error))
 

@@ -9,12 +9,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import LARGEST, number, positive, real_array
+from gdptlab._checks import LARGEST, function, generator, iterable, number, positive, real_array
 from gdptlab._checks import table as check_table
 
 RESAMPLES = 1000
 """Number of draws of the bootstrap. Convention: the ends of a 95 % interval are then known to about a tenth of its
 width; the time grows with their number."""
+
+FAR_PX = 1e5
+"""Distance in x, px, by which the frames of a film are set apart to be matched at once; any above a frame's width."""
 
 AXES = {"dx_px": "x_px", "dy_px": "y_px", "dz_um": "z_um"}
 """Column of a position, by the column of its error."""
@@ -87,6 +90,39 @@ def _match_frame(measured: pd.DataFrame, true: pd.DataFrame, within_px: float, w
     pairs = {"measured": measured.index[i[chosen]], "true": true.index[j[chosen]]}
     pairs |= dict(zip(AXES, difference[chosen].T, strict=True))
     return pd.DataFrame(pairs | {"z_um": there[j[chosen], 2]})
+
+
+def count_valid(
+    measured: pd.DataFrame,
+    true: pd.DataFrame,
+    frames: ArrayLike,
+    *,
+    within_px: float = 2.0,
+    within_um: float = 10.0,
+) -> NDArray[np.intp]:
+    """Count the valid particles of each frame: measured ones that `match` pairs with a true one.
+
+    Parameters
+    ----------
+    measured, true, within_px, within_um
+        As in `match`, with the column `frame` in both.
+    frames : int array (n,)
+        Frames that are counted, increasing.
+
+    Returns
+    -------
+    int array (n,)
+    """
+    numbers = np.asarray(frames)
+    if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or (np.diff(numbers) <= 0).any():
+        raise ValueError(f"frames: got {frames!r}, allowed are increasing whole numbers")
+    for name, table in (("measured", measured), ("true", true)):
+        check_table(name, table, ["frame", *AXES.values()])
+    true = true[true["frame"].isin(numbers)]
+    # All frames at once, each far from the others: `match` frame by frame takes longer than the evaluation.
+    far_apart = (t.assign(x_px=t["x_px"] + FAR_PX * t["frame"]).drop(columns="frame") for t in (measured, true))
+    pairs = match(*far_apart, within_px=within_px, within_um=within_um)
+    return np.bincount(np.searchsorted(numbers, true["frame"].loc[pairs["true"]]), minlength=len(numbers))
 
 
 def scores(measured: pd.DataFrame, true: pd.DataFrame, *, within_px: float = 2.0, within_um: float = 10.0) -> pd.Series:
@@ -192,14 +228,15 @@ def standard_assessment(
     TypeError, ValueError
         If an argument is not of that form, or there are fewer than two frames.
     """
-    if not callable(locator):
-        raise TypeError(f"locator: got {locator!r}, allowed is a function that takes a frame and returns a table")
+    function("locator", locator)
     check_table("true", true, ["frame", *AXES.values()])
     if not 0 < number("confidence", confidence) < 1:
         raise ValueError(f"confidence: got {confidence}, allowed is above 0 and below 1")
     tables, allowed = [], {"within_px": within_px, "within_um": within_um}
-    for k, frame in enumerate(frames):
-        measured, here = locator(frame), true[true["frame"] == k].drop(columns="frame")
+    rng = generator("rng", rng)
+    for k, frame in enumerate(iterable("frames", frames)):
+        measured = check_table("locator", locator(frame), AXES.values())
+        here = true[true["frame"] == k].drop(columns="frame")
         measured = measured.drop(columns="frame", errors="ignore")
         if edges_um is None:
             tables.append(scores(measured, here, **allowed).to_frame().T)
@@ -208,7 +245,7 @@ def standard_assessment(
     if len(tables) < 2:
         raise ValueError(f"frames: got {len(tables)}, allowed are two or more")
     sums = np.stack([_sums(table) for table in tables])
-    drawn = np.random.default_rng(rng).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
+    drawn = rng.multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
     best, again = _from_sums(sums.sum(axis=0)), _from_sums(np.einsum("rf,fbs->rbs", drawn, sums))
     tail = (1 - confidence) / 2
     columns = {}

@@ -5,29 +5,24 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 """
 
 import os
-import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import depths, flag, image_array, whole
+from gdptlab._checks import choice, depths, flag, image_array, instance, positive, whole
 from gdptlab._compiled import on_one_core
-from gdptlab._files import written_whole
 from gdptlab._plans import planned
 from gdptlab.correlation import Correlator, normalised
 from gdptlab.denoising import denoised
+from gdptlab.preparation import Preparation, preparation
 from gdptlab.refinement import Displacement
 
-VERSION = 1
-"""Of the file format of `Calibration.save`."""
-
-PARTS = {"stack": 3, "z_um": 1, "subset": 1, "templates": 3}
-"""Arrays in the file of `Calibration.save`, and how many axes each has."""
+SIDES = ("near", "far")
+"""Sides of focus: depths smaller, and larger, than that of the sharpest image."""
 
 LOSSLESS = 0.98
 """Templates that keep this correlation with themselves at half resolution are searched for there."""
@@ -51,6 +46,10 @@ class Calibration:
         Patterns that `from_scan` learned from all beads of a scan at once, which the joint fit then draws with.
     report : ScanReport, optional
         How `from_scan` came to this calibration.
+    depth_factor : float
+        Depth in the sample over travel of the stage that `z_um` contains (`with_depth_factor`); 1 if it is as given.
+    camera : Preparation, optional
+        Dark and flat image that the scan was corrected with, and with which `batch` corrects frames, too.
     """
 
     stack: NDArray[np.float32]
@@ -59,6 +58,8 @@ class Calibration:
     templates: NDArray[np.float32]
     learned: Any = None
     report: Any = None
+    depth_factor: float = 1.0
+    camera: Preparation | None = None
 
     @classmethod
     @on_one_core
@@ -76,7 +77,8 @@ class Calibration:
         Parameters
         ----------
         stack : array (N, n, n)
-            Any real type; n odd, the particle in the middle.
+            Any real type, the particle in the middle. If n is even, the first or the last row and column are left out,
+            so that the pixel nearest to the centre of symmetry of the images is in the middle.
         z_um : array (N,)
             Depths, strictly increasing or decreasing.
         n_sub : int
@@ -95,12 +97,14 @@ class Calibration:
             of range.
         """
         stack, z_um = image_array("stack", stack, 3), depths("z_um", z_um)
-        if stack.shape[1] != stack.shape[2] or stack.shape[1] % 2 == 0:
-            raise ValueError(f"stack: got images of {stack.shape[1:]} px, allowed are square ones of odd size")
+        if stack.shape[1] != stack.shape[2] or stack.shape[1] < 3:
+            raise ValueError(f"stack: got images of {stack.shape[1:]} px, allowed are square ones of 3 px or more")
         if len(stack) < 3:
             raise ValueError(f"stack: got {len(stack)} images, allowed are 3 or more")
         if len(z_um) != len(stack):
             raise ValueError(f"z_um: got {len(z_um)} depths, needed is one for each of {len(stack)} images")
+        if stack.shape[1] % 2 == 0:
+            stack = _odd(stack)
         constant = np.flatnonzero(np.ptp(stack, axis=(1, 2)) == 0)
         if len(constant):
             raise ValueError(f"stack: got constant images at {constant.tolist()}, allowed are images with contrast")
@@ -126,6 +130,102 @@ class Calibration:
         """
         subset = _middles(len(self), whole("n_sub", n_sub, 2, len(self)))
         return replace(self, subset=subset)
+
+    def with_depth_factor(self, factor: float | tuple[float, float]) -> Self:
+        """Return the same calibration with depths in the sample, where `z_um` was the travel of the stage.
+
+        When the stage moves by dz, the focus moves within the sample by the factor times dz, as light is refracted
+        where it leaves the sample: n_sample / n_immersion for rays near the axis, 1.33 for water and a dry lens. (Rays
+        at the rim of an aperture NA need more, sqrt((n_sample^2 - NA^2) / (n_immersion^2 - NA^2)). Above NA of about
+        0.5 measure it: focus on the floor and on the ceiling of a channel of known height, filled as in the
+        experiment; the factor is the height over the travel.)
+
+        Parameters
+        ----------
+        factor : float or (n_immersion, n_sample)
+            Depth over travel, as it was measured; or refractive indices of what is between lens and cover glass (air
+            1, water 1.33, oil 1.52), and of the liquid about the particles.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If it is neither, or not from 0.1 to 10.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> stack = np.random.default_rng(1).normal(size=(3, 5, 5))
+        >>> calibration = Calibration.from_stack(stack, [0, 1, 2], n_sub=2)
+        >>> calibration.with_depth_factor((1.0, 1.33)).z_um
+        array([0.  , 1.33, 2.66])
+        """
+        if isinstance(factor, tuple | list):
+            if len(factor) != 2:
+                raise ValueError(f"factor: got {factor!r}, allowed are two refractive indices: immersion, sample")
+            factor = positive("factor", factor[1]) / positive("factor", factor[0])
+        if not 0.1 <= positive("factor", factor) <= 10:
+            raise ValueError(f"factor: got {factor:g}, allowed is 0.1 to 10")
+        ratio = factor / self.depth_factor
+        changes: dict[str, Any] = {"z_um": self.z_um * ratio, "depth_factor": float(factor)}
+        if self.learned is not None:
+            changes["learned"] = replace(
+                self.learned,
+                z_um=self.learned.z_um * ratio,
+                own_error=self.learned.own_error * (1, 1, ratio),
+                own_bias_um=self.learned.own_bias_um * ratio,
+            )
+        if self.report is not None:
+            beads = self.report.beads
+            changes["report"] = replace(self.report, beads=beads.assign(offset_um=beads["offset_um"] * ratio))
+        return replace(self, **changes)
+
+    def one_side(self, side: str) -> Self:
+        """Return the part of the calibration on one side of focus, where images of both sides look alike.
+
+        Parameters
+        ----------
+        side : str
+            "near": depths up to that of the sharpest image; "far": from there on.
+
+        Raises
+        ------
+        ValueError
+            If it is neither, or fewer than 3 images lie on that side.
+        """
+        return self._near if choice("side", side, SIDES) == "near" else self._far
+
+    @cached_property
+    def _near(self) -> Self:
+        return self._part("near", slice(0, self._sharpest + 1))
+
+    @cached_property
+    def _far(self) -> Self:
+        return self._part("far", slice(self._sharpest, len(self)))
+
+    @property
+    def _sharpest(self) -> int:
+        """Index of the image whose light lies in the fewest pixels."""
+        return int((self.templates.astype(np.float64) ** 4).sum(axis=(1, 2)).argmax())
+
+    def _part(self, side: str, part: slice) -> Self:
+        """Calibration with some of the images, if there are enough."""
+        n = len(self.z_um[part])
+        if n < 3:
+            raise ValueError(f"side: got {side!r}, where the calibration has {n} images, allowed is a side with 3")
+        changes = {name: getattr(self, name)[part] for name in ("stack", "z_um", "templates")}
+        changes["subset"] = _middles(n, min(len(self.subset), n))
+        if self.learned is not None:
+            model = self.learned
+            changes["learned"] = replace(
+                model,
+                patterns=model.patterns[:, part],
+                modes=None if model.modes is None else model.modes[:, part],
+                **{name: getattr(model, name)[part] for name in ("z_um", "pattern_error", "own_error", "own_bias_um")},
+            )
+        if self.report is not None:
+            of_slices = {name: getattr(self.report, name)[part] for name in ("drift_px", "clipped")}
+            changes["report"] = replace(self.report, **of_slices)
+        return replace(self, **changes)
 
     @classmethod
     def from_bead(
@@ -180,6 +280,7 @@ class Calibration:
         n_sub: int | None = None,
         field: bool = False,
         modes: int = 0,
+        prepare: Preparation | None = None,
     ) -> Self:
         """Calibrate with a scan of full frames: beads, size of the templates and subset are found in the scan.
 
@@ -203,6 +304,9 @@ class Calibration:
         modes : int
             For the joint fit: learn from all beads of the scan in how many ways their images differ (by size, say), so
             that a particle may differ as they do. About eight beads are needed for each.
+        prepare : Preparation, optional
+            Its dark and flat image correct the scan. The calibration remembers them (`camera`). The rest of it is for
+            films.
 
         Returns
         -------
@@ -212,12 +316,16 @@ class Calibration:
         Raises
         ------
         TypeError, ValueError
-            If an argument is not of that form, nothing in the scan changes with z, or no bead can be used: the message
-            says why not.
+            If an argument is not of that form, nothing in the scan changes with z, it is a film of particles that flow,
+            or no bead can be used: the message says why not.
         """
         from gdptlab.pipeline.beads import averaged_beads
 
+        camera = None if prepare is None else preparation(prepare).camera
+        if camera is not None:
+            scan = np.asarray(camera(scan))
         calibration = averaged_beads(scan, z_um, beads_px=beads_px, size=size, n_sub=n_sub)
+        calibration = replace(calibration, camera=camera)
         if not flag("field", field) and whole("modes", modes, 0, 100) == 0:
             return calibration
         from gdptlab.fit.learning import learned
@@ -284,7 +392,7 @@ class Calibration:
 
     @cached_property
     def displacement(self) -> Displacement:
-        """What finds the part of a pixel and of a step by which a particle is off a template."""
+        """Finds the part of a pixel and of a slice by which a particle is off a template."""
         return Displacement(self.templates, self.z_um)
 
     def correlator(self, shape: tuple[int, int]) -> Correlator:
@@ -305,20 +413,9 @@ class Calibration:
             If the name does not end in .npz, or the calibration has patterns learned from a whole scan (`learned`):
             the file has no place for them, and without them it would measure otherwise.
         """
-        path = Path(path)
-        if self.learned is not None:
-            raise ValueError("path: got a calibration with `learned` patterns, allowed is one without; learn it again")
-        if path.suffix != ".npz":
-            raise ValueError(f"path: got {path.name!r}, allowed are names that end in .npz")
-        with written_whole(path) as temporary:
-            np.savez_compressed(
-                temporary,
-                gdptlab_calibration=VERSION,
-                stack=self.stack,
-                z_um=self.z_um,
-                subset=self.subset,
-                templates=self.templates,
-            )
+        from gdptlab.pipeline.calibration_file import write
+
+        write(self, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Self:
@@ -331,57 +428,9 @@ class Calibration:
         ValueError
             If it is damaged, of another version, or no calibration.
         """
-        name = Path(path).name
-        try:
-            with zipfile.ZipFile(path) as archive:
-                shapes = {part.removesuffix(".npy"): _shape(archive, part) for part in archive.namelist()}
-                _must_fit(shapes, {part.filename: part.file_size for part in archive.infolist()})
-            with np.load(path, allow_pickle=False) as file:
-                version = file["gdptlab_calibration"]
-                if not np.array_equal(version, VERSION):
-                    raise ValueError(f"it is of version {version}, allowed is version {VERSION}")
-                data = {part: file[part] for part in PARTS}
-            _must_be_sound(data)
-        except FileNotFoundError:
-            raise
-        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ValueError(f"path: got {name!r}, which cannot be read as a calibration: {error}") from error
-        return cls(**data)
+        from gdptlab.pipeline.calibration_file import read
 
-
-def _shape(archive: zipfile.ZipFile, part: str) -> tuple[int, ...]:
-    """Shape of an array in a file of numpy's, from its header alone."""
-    with archive.open(part) as opened:
-        major = np.lib.format.read_magic(opened)[0]
-        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-        return read(opened)[0]
-
-
-def _must_fit(shapes: dict[str, tuple[int, ...]], sizes: dict[str, int]) -> None:
-    """Raise ValueError unless the arrays of a file, by their shapes, are those of a calibration and fit each other."""
-    if set(shapes) != {"gdptlab_calibration", *PARTS}:
-        raise ValueError(f"it holds {', '.join(shapes)}, needed are gdptlab_calibration, {', '.join(PARTS)}")
-    stack, images = shapes["stack"], len(shapes["z_um"]) and shapes["z_um"][0]
-    square = len(stack) == 3 and stack[0] == images >= 3 and stack[1] == stack[2] and stack[1] % 2 == 1
-    subset = len(shapes["subset"]) == 1 and 2 <= shapes["subset"][0] <= images
-    if not (square and subset and len(shapes["z_um"]) == 1 and shapes["templates"] == stack):
-        raise ValueError(f"its arrays have shapes that do not fit each other: {shapes}")
-    if max(sizes.values()) > 16 * np.prod(stack) + 1000:
-        raise ValueError(f"its arrays have more bytes than shapes: {sizes}")
-
-
-def _must_be_sound(data: dict[str, NDArray]) -> None:
-    """Raise ValueError unless arrays that fit each other are what `from_stack` would make of them."""
-    for part in PARTS:
-        if data[part].dtype.kind != ("i" if part == "subset" else "f") or not np.isfinite(data[part]).all():
-            raise ValueError(f"{part} holds what is not finite or not of its type, {data[part].dtype}")
-    if not (np.diff(data["z_um"]) > 0).all():
-        raise ValueError("z_um does not increase")
-    subset = data["subset"]
-    if subset.min() < 0 or subset.max() >= len(data["stack"]) or not (np.diff(subset) > 0).all():
-        raise ValueError(f"subset does not name images in increasing order: {subset}")
-    if np.abs(np.linalg.norm(data["templates"], axis=(1, 2)) - 1).max() > 1e-3:
-        raise ValueError("templates do not have norm 1")
+        return cls(**read(path))
 
 
 def _correlator(calibration: Calibration, shape: tuple[int, int]) -> Correlator:
@@ -397,9 +446,7 @@ def checked(calibration: object) -> Calibration:
     TypeError
         If not.
     """
-    if isinstance(calibration, Calibration):
-        return calibration
-    raise TypeError(f"calibration: got a {type(calibration).__name__}, allowed is a Calibration")
+    return instance("calibration", calibration, Calibration)
 
 
 def _middles(n: int, n_sub: int) -> NDArray[np.int64]:
@@ -426,6 +473,20 @@ def levelled(images: NDArray) -> NDArray:
     unit = ramp / (n * (ramp**2).sum())
     down, across = (np.einsum(f"...ij,{axis}->...", images, unit)[..., None, None] for axis in "ij")
     return images - images.mean(axis=(-2, -1), keepdims=True) - down * ramp[:, None] - across * ramp
+
+
+def _odd(stack: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Images (N, n, n) of even size without the row and the column that are farther from their centre of symmetry.
+
+    An image that is symmetric under half a turn about c correlates best with the turned one when that is moved by
+    2 c - (n - 1), which is where the product of its spectrum with itself has its maximum.
+    """
+    n = stack.shape[1]
+    spectrum = np.fft.rfft2(levelled(stack), s=(2 * n, 2 * n))
+    turned = np.fft.irfft2((spectrum**2).sum(axis=0))
+    along = (turned.max(axis=1), turned.max(axis=0))  # 2 c, along rows and columns, is where these are largest
+    down, right = (slice(1, None) if p[n:].max() > p[: n - 1].max() else slice(None, -1) for p in along)
+    return np.ascontiguousarray(stack[:, down, right])
 
 
 def _even_centre(images: NDArray) -> NDArray:

@@ -99,14 +99,12 @@ def planar_beads() -> PlanarBeads:
     FileNotFoundError
         If they are in neither folder; the message says how to get them.
     """
-    folders = [Path(p) for p in (os.environ.get("GDPTLAB_DATA"), DATA / "external") if p]
-    folder = next((p / "planar_beads" for p in folders if (p / "planar_beads").is_dir()), None)
-    if folder is None:
-        raise FileNotFoundError(
-            "The planar-bead images are not on this machine. Their authors publish them on GitHub in the repository "
-            "sean-mackenzie/idpt; put calibration.tif, calibration_z.csv, test.tif, test_frames.csv, beads.csv and "
-            "published/ into data/external/planar_beads, or name the folder above it in the variable GDPTLAB_DATA."
-        )
+    folder = _external(
+        "planar_beads",
+        "The planar-bead images are not on this machine. Their authors publish them on GitHub in the repository "
+        "sean-mackenzie/idpt; put calibration.tif, calibration_z.csv, test.tif, test_frames.csv, beads.csv and "
+        "published/ into data/external/planar_beads, or name the folder above it in the variable GDPTLAB_DATA.",
+    )
     heights = pd.read_csv(folder / "test_frames.csv")[["frame", "z_plane_um"]].rename(columns={"z_plane_um": "z_um"})
     return PlanarBeads(
         scan=tifffile.imread(folder / "calibration.tif"),
@@ -115,3 +113,37 @@ def planar_beads() -> PlanarBeads:
         truth=heights.merge(pd.read_csv(folder / "beads.csv"), how="cross"),
         published={p.stem: pd.read_csv(p) for p in sorted((folder / "published").glob("*.csv"))},
     )
+
+
+def astigmatic_bead() -> NDArray[np.float32]:
+    """Load a real astigmatic bead, if its images are on this machine.
+
+    They belong to python-microscopy (`PYME/localization/Test/psf_astig.tif`, GPL-3.0) and are not part of this
+    repository. They are looked for in a folder `psf_astig`, where `planar_beads` looks.
+
+    Returns
+    -------
+    float32 array (61, 61, 61)
+        Slices, rows, columns; without background, scaled to 0 ... 1. The distance between the slices is not known.
+
+    Raises
+    ------
+    FileNotFoundError
+        If it is in neither folder; the message says how to get it.
+    """
+    folder = _external(
+        "psf_astig",
+        "The astigmatic bead is not on this machine. It is published on GitHub in the repository "
+        "python-microscopy/python-microscopy as PYME/localization/Test/psf_astig.tif; put it into "
+        "data/external/psf_astig, or name the folder above it in the variable GDPTLAB_DATA.",
+    )
+    return tifffile.imread(folder / "psf_astig.tif").astype(np.float32)
+
+
+def _external(name: str, missing: str) -> Path:
+    """Folder of other people's images; `missing` is said if there is none."""
+    folders = [Path(p) / name for p in (os.environ.get("GDPTLAB_DATA"), DATA / "external") if p]
+    folder = next((p for p in folders if p.is_dir()), None)
+    if folder is None:
+        raise FileNotFoundError(missing)
+    return folder

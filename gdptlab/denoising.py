@@ -22,8 +22,8 @@ DOUBT = 2.0
 part of the noise where there is nothing else."""
 
 FIRST_BLUR = 1.5
-"""Standard deviation, in slices and px, of the Gaussian filter that gives the first guess of the light behind each
-pixel's photon noise. The guess only sorts pixels by their light, so that its width hardly matters."""
+"""Standard deviation, in slices and px, of the Gaussian filter that gives a first estimate of each pixel's value
+without noise. It only sorts pixels by their value, so that its width hardly matters."""
 
 LEAST_IN_BIN = 100
 """Fewest pixels from whose scatter a variance is taken; it is then known to 15 %."""
@@ -51,9 +51,9 @@ def denoised(stack: NDArray) -> NDArray[np.float32]:
     float32 array (N, n, n)
     """
     stack = np.asarray(stack, dtype=np.float32)
-    guess = gaussian_filter(stack, FIRST_BLUR, mode="nearest")
+    blurred = gaussian_filter(stack, FIRST_BLUR, mode="nearest")
     # The first line takes fine structure for noise, the second one only what the first filter took for noise.
-    smooth = _smoothed(stack, np.polyval(noise_line(stack, guess), guess))
+    smooth = _smoothed(stack, np.polyval(noise_line(stack, blurred), blurred))
     return _smoothed(stack, np.polyval(noise_line(stack - smooth, smooth), smooth))
 
 
@@ -62,13 +62,13 @@ def _smoothed(stack: NDArray[np.float32], variance: NDArray[np.float64]) -> NDAr
     half = stack.shape[1] // 2
     over = min(BLOCK // 2, half)  # blocks reach beyond the middle
     levels = stack.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
-    rest = (stack - levels).astype(np.float32)
+    centred = (stack - levels).astype(np.float32)
     variance = (variance + variance[:, ::-1]).astype(np.float32)
     variance = (variance + variance[:, :, ::-1])[:, half - over :, half - over :] / 16
-    smooth, away = np.zeros_like(rest), np.arange(-half, half + 1)
+    smooth, away = np.zeros_like(centred), np.arange(-half, half + 1)
     sides = {1: np.ones(len(away), np.float32), -1: np.sign(away).astype(np.float32)}
     for down, y_side in sides.items():
-        part = (rest + down * rest[:, ::-1]) / 2
+        part = (centred + down * centred[:, ::-1]) / 2
         for across, x_side in sides.items():
             quarter = (part + across * part[:, :, ::-1])[:, half - over :, half - over :] / 2
             quarter = _filtered(quarter, variance)[:, over:, over:]
@@ -131,7 +131,7 @@ def noise_line(noise: NDArray, smooth: NDArray) -> NDArray[np.float64]:
     Parameters
     ----------
     noise : array (..., rows, columns)
-        Images, or what a smooth model leaves of them.
+        Images, or their residual less a smooth model.
     smooth : array (..., rows, columns)
         About their values without noise.
 
@@ -151,8 +151,8 @@ def noise_line(noise: NDArray, smooth: NDArray) -> NDArray[np.float64]:
     least = (np.median(size) / MEDIAN_SIZE) ** 2 / 4
     if len(bins) < 4 or span == 0 or least == 0:
         return np.array([0, 4 * least])
-    light = np.array([value[part].mean() - darkest for part in bins]) / span
-    terms = np.stack([np.ones(len(bins)), light], axis=1) / np.maximum(variance, least)[:, None]
+    relative = np.array([value[part].mean() - darkest for part in bins]) / span
+    terms = np.stack([np.ones(len(bins)), relative], axis=1) / np.maximum(variance, least)[:, None]
     level, slope = nnls(terms, variance / np.maximum(variance, least))[0]
     return np.array([slope / span, max(level, least) - slope / span * darkest])
 

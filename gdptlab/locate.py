@@ -9,7 +9,7 @@ By correlation (the paper's section 2):
 4. z is where the measured profile agrees best with an expected one, by Pearson's correlation, since noise lowers
    the whole profile and Pearson's correlation does not depend on its level. A parabola through the best three gives z
    between slices.
-5. Refinement: the window of the candidate is correlated with templates from the guess onward, uphill along z until C_m
+5. Refinement: the window of the candidate is correlated with templates from that slice onward, uphill along z until C_m
    no longer rises. Between pixels and slices, x, y and z follow from least squares in that window (`refinement`).
 6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
 
@@ -20,7 +20,8 @@ frame's edge.
 
 from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager
-from itertools import count, islice
+from dataclasses import replace
+from itertools import count, islice, product
 
 import cv2
 import numpy as np
@@ -29,10 +30,12 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from gdptlab._checks import choice, flag, image_array, positive, whole
+from gdptlab._checks import choice, flag, image_array, iterable, positive, processes
 from gdptlab._compiled import on_one_core
+from gdptlab._workers import leave_with_parent
 from gdptlab.calibration import Calibration, checked
 from gdptlab.correlation import peaks, standardised, strongest, vertex
+from gdptlab.preparation import Preparation, Prepared, preparation
 
 COLUMNS = {"x_px": float, "y_px": float, "z_um": float, "cm": float, "at_end": bool}
 """Columns of the table that `locate` returns by correlation, and their types."""
@@ -42,6 +45,16 @@ THRESHOLD = 0.5
 
 METHODS = ("correlation", "joint")
 """Methods of `locate`."""
+
+TILE_PX = 1024
+"""Largest number of rows and columns of a frame that is correlated as a whole; a larger one is cut into tiles that
+overlap. Chosen on 8192 x 8192 px of uint16 and 9 templates: the
+process takes 0.47 GB, or 0.55 GB where templates are searched for at full resolution; with 2048, 0.55 and 0.84 GB; as a
+whole, 2.2 GB and more. The smaller the tiles, the more is computed twice. The table is the same."""
+
+AROUND_PX = 16
+"""Width, px, of a tile's border, besides half a template, within which no particle is looked for. Derived: a walk moves
+a window by up to `refinement.MOST_WINDOWS` = 8 px, and the search, at half resolution, needs some 8 px about a peak."""
 
 BLOCK = 25
 """Number of consecutive frames that `batch` hands to a process at a time. Chosen: measuring them takes some hundred
@@ -57,6 +70,7 @@ def locate(
     threshold: float | None = None,
     refine: bool = True,
     min_distance_px: float | None = None,
+    side: str | None = None,
 ) -> pd.DataFrame:
     """Measure x, y and z of every particle in a frame.
 
@@ -75,6 +89,9 @@ def locate(
         Walk along the whole stack to the best C_m. Without refinement, z comes from the subset's profile alone.
     min_distance_px : float, optional
         Smallest distance of two particles; a quarter of a template if not given.
+    side : str, optional
+        "near" or "far": only depths on this side of focus, smaller or larger, for optics whose images look alike on
+        both (`Calibration.one_side`).
 
     Returns
     -------
@@ -102,24 +119,63 @@ def locate(
     >>> list(table)
     ['x_px', 'y_px', 'z_um', 'cm', 'at_end']
     """
+    if side is not None:
+        calibration = checked(calibration).one_side(side)
     if choice("method", method, METHODS) == "joint":
         if threshold is not None or not flag("refine", refine) or min_distance_px is not None:
             raise ValueError("threshold, refine, min_distance_px: got one with method 'joint', which has none of them")
         from gdptlab.fit.frames import explained
 
         return explained(image, calibration)[0]
-    threshold = THRESHOLD if threshold is None else threshold
-    image, distance = checked_frame(image, calibration, threshold, min_distance_px)
-    position, slice_, cm = _candidates(image, calibration, threshold)
-    if flag("refine", refine):
-        position, slice_, cm = _refined(image, calibration, position, slice_)
+    threshold, found = THRESHOLD if threshold is None else threshold, []
+    for tile, corner, limits in _tiles(image, checked(calibration).size):
+        tile, distance = checked_frame(tile, calibration, threshold, min_distance_px)
+        position, exact, slice_, cm = _found(tile, calibration, threshold, flag("refine", refine), limits - corner)
+        found.append((position + corner, exact + corner, slice_, cm))
+    position, exact, slice_, cm = map(np.concatenate, zip(*found, strict=True))
     kept = strongest(position, np.where(cm >= threshold, cm, 0), distance)
-    position, slice_, cm = position[kept], slice_[kept], cm[kept]
-    if not refine:
-        first = _pixels(image, calibration, position)
-        shift = calibration.displacement(image, first, np.rint(slice_))
-        position = first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1)
-    return as_table(position, slice_, cm, calibration.z_um)
+    return as_table(exact[kept], slice_[kept], cm[kept], calibration.z_um)
+
+
+def _tiles(image: ArrayLike, size: int) -> Iterator[tuple[ArrayLike, NDArray, NDArray]]:
+    """Cut a large frame, for templates of `size` px, into tiles of equal shape that overlap.
+
+    Yields each tile, its first pixel (row, column), and the limits (2, 2) in the frame, lower and upper row and column,
+    between which the tile alone counts. A frame that is not large, or no frame, is its own tile.
+    """
+    whole_ = not isinstance(image, np.ndarray) or image.ndim != 2 or min(image.shape) < size
+    sides = [[(0, None, -np.inf, np.inf)]] * 2 if whole_ else [_sides(length, size) for length in image.shape]
+    for (top, bottom, low_y, high_y), (left, right, low_x, high_x) in product(*sides):
+        tile = image if whole_ else image[top:bottom, left:right]
+        yield tile, np.array([top, left]), np.array([[low_y, low_x], [high_y, high_x]])
+
+
+def _sides(length: int, size: int) -> list[tuple[int, int, float, float]]:
+    """First pixel (even, for half resolution), end, and limits of each tile along an axis of a frame."""
+    border = size // 2 + AROUND_PX
+    edge = max(TILE_PX, 4 * border)
+    if length <= edge:
+        return [(0, length, -np.inf, np.inf)]
+    edge -= (length - edge) % 2
+    n = int(np.ceil((length - 2 * border) / (edge - 2 * border - 2)))
+    first = 2 * np.rint(np.linspace(0, (length - edge) / 2, n)).astype(int)
+    middles = (first[1:] + first[:-1] + edge) / 2  # of the overlaps
+    return list(zip(first, first + edge, [-np.inf, *middles], [*middles, np.inf], strict=True))
+
+
+def _found(
+    image: NDArray[np.float32], calibration: Calibration, threshold: float, refine: bool, limits: NDArray
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Candidates between limits (2, 2): positions (y, x) (n, 2), finer ones if not refined, slices and C_m (n,)."""
+    position, slice_, cm = _candidates(image, calibration, threshold)
+    here = ((position >= limits[0]) & (position < limits[1])).all(axis=1)
+    position, slice_, cm = position[here], slice_[here], cm[here]
+    if refine:
+        position, slice_, cm = _refined(image, calibration, position, slice_)
+        return position, position, slice_, cm
+    first = _pixels(image, calibration, position)
+    shift = calibration.displacement(image, first, np.rint(slice_))
+    return position, first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1), slice_, cm
 
 
 def checked_frame(
@@ -197,6 +253,7 @@ def batch(
     *,
     n_jobs: int = 1,
     progress: bool = True,
+    prepare: Preparation | None = None,
     **settings: object,
 ) -> pd.DataFrame:
     """Measure every particle in every frame.
@@ -214,6 +271,9 @@ def batch(
         the blocks go to all workers of the dask cluster instead. With method "joint" it is 1.
     progress : bool
         Show a progress bar.
+    prepare : Preparation, optional
+        Dark and flat image, background, mask, region, frames. The table is in the pixels and by the frames of the film.
+        Without a dark and a flat image, frames are corrected as the calibration's scan was (`Calibration.camera`).
     **settings
         Of `locate`. With method "joint" the frames should follow each other: each begins with the particles
         of the last, which keeps them apart where they meet later, and one that appears is in the table from
@@ -234,17 +294,35 @@ def batch(
         raise ValueError(
             f"frames: got one of shape {frames.shape}, allowed is a film of them; `locate` measures one frame"
         )
-    try:
-        iter(frames)
-    except TypeError as error:
-        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+    iterable("frames", frames)
+    frames, prepare = prepared(frames, calibration, prepare)
     tables = [blank]
     total = len(frames) if hasattr(frames, "__len__") else None
-    with tqdm(total=total, desc="frames", unit="frame", disable=not progress) as bar:
+    with tqdm(total=total, desc="frames", unit="frame", disable=not flag("progress", progress)) as bar:
         for _, n, table in in_blocks(frames, calibration, n_jobs, settings):
             tables.append(table)
             bar.update(n)
-    return pd.concat(tables, ignore_index=True)[[*blank]]
+    table = pd.concat(tables, ignore_index=True)[[*blank]]
+    return table if prepare is None else prepare.restored(table)
+
+
+def prepared(
+    frames: Iterable[ArrayLike], calibration: Calibration, prepare: Preparation | None
+) -> tuple[Iterable[ArrayLike], Preparation | None]:
+    """Frames as they are to be measured, and the preparation by which their table is to be restored, if there is one.
+
+    Frames that are prepared already stay as they are.
+    """
+    if prepare is None and not isinstance(frames, Prepared):
+        prepare = calibration.camera
+    if prepare is None:
+        return frames, None
+    if isinstance(frames, Prepared):
+        raise ValueError("prepare: got one for frames that are prepared already, allowed are frames as they come")
+    prepare, camera = preparation(prepare), calibration.camera
+    if prepare.camera is None and camera is not None:
+        prepare = replace(prepare, dark=camera.dark, flat=camera.flat)
+    return prepare(frames), prepare
 
 
 def blank_table(calibration: Calibration, n_jobs: int, settings: dict[str, object]) -> pd.DataFrame:
@@ -253,8 +331,7 @@ def blank_table(calibration: Calibration, n_jobs: int, settings: dict[str, objec
     What is wrong with the settings is refused before the film begins, and what a calibration makes only when it
     is needed is made here, not by every process for every block.
     """
-    if n_jobs != -1:
-        whole("n_jobs", n_jobs, 1, 10_000)
+    n_jobs = processes("n_jobs", n_jobs)
     blank = locate(np.zeros((checked(calibration).size,) * 2), calibration, **settings)
     if settings.get("method") == "joint" and n_jobs != 1:
         raise ValueError(f"n_jobs: got {n_jobs}, allowed with method 'joint' is 1: a frame begins with the last")
@@ -273,6 +350,8 @@ def in_blocks(
     Blocks whose first frame is in `done` are left out. A film by the joint fit is one chain, so that what comes
     before a missing block is measured once more; otherwise blocks know nothing of each other.
     """
+    if settings.get("side") is not None:
+        calibration, settings = calibration.one_side(settings["side"]), settings | {"side": None}
     if settings.get("method") == "joint":
         from gdptlab.fit.frames import explained
 
@@ -288,7 +367,8 @@ def in_blocks(
         return
     jobs = (delayed(_located)(block, first, calibration, settings) for first, block in _blocks(frames, done))
     # What joblib puts into shared memory stays there until the last frame: of a long film too much.
-    for first, n, table in Parallel(n_jobs, return_as="generator", pre_dispatch="n_jobs + 1", max_nbytes=None)(jobs):
+    how = {"pre_dispatch": "n_jobs + 1", "max_nbytes": None, "initializer": leave_with_parent}
+    for first, n, table in Parallel(n_jobs, return_as="generator", **how)(jobs):
         if isinstance(table, Exception):
             raise table
         yield first, n, table

@@ -44,6 +44,13 @@ class Displacement:
         Normalised.
     z_um : array (N,)
         Their depths, increasing.
+
+    Attributes
+    ----------
+    covariance : float64 array (N, 3, 3)
+        Of dy, dx (px) and dz (µm), for noise of 1 in each pixel and an amplitude of 1.
+    unknowns : int
+        Number of unknowns of least squares.
     """
 
     def __init__(self, templates: NDArray, z_um: NDArray) -> None:
@@ -53,6 +60,7 @@ class Displacement:
         background = [np.broadcast_to(b, templates.shape) for b in (np.ones((n, n)), *np.indices((n, n)) - n // 2)]
         columns = np.stack([c.reshape(count, -1) for c in (*linear, *background)], axis=2)
         rows = np.linalg.pinv(columns)[:, :4]
+        self.covariance, self.unknowns = rows[:, 1:] @ rows[:, 1:].transpose(0, 2, 1), columns.shape[2]
         curved = np.stack([_difference(templates, i, j).reshape(count, -1) for i, j in CURVED], axis=2)
         self._rows = np.ascontiguousarray(rows, dtype=np.float32)
         self._curved = rows @ curved

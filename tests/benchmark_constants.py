@@ -1,9 +1,11 @@
 """What the constants chosen on data do at both ends: ``GDPTLAB_DATA=... python tests/benchmark_constants.py``, an hour.
 
-Each line is a constant with its value, and what becomes of two scans with it: the real planar beads and the synthetic
-one. The docstrings of the constants in `gdptlab/pipeline` quote these lines.
+``python tests/benchmark_constants.py synthetic rim dips thresholds spacing`` does only the synthetic scan, and only
+those parts, in some minutes. Each line is a constant with its value, and what becomes of two scans with it: the real
+planar beads and the synthetic one. The docstrings of the constants in `gdptlab/pipeline` quote these lines.
 """
 
+import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -63,28 +65,49 @@ def outcome(name: str) -> str:
     )
 
 
-def main() -> None:
+def beads_found(scans: dict[str, int]) -> None:
+    """Constants by which beads are found and chosen."""
     for constant, values in OF_BEADS.items():
         for value in values:
             with changed(beads, constant, value):
-                print(f"beads.{constant} = {value}:", *(f"{name}: {outcome(name)};" for name in SCANS), flush=True)
-    for name, size in SCANS.items():
-        scan, z_um, frames, *_ = images(name)
+                print(f"beads.{constant} = {value}:", *(f"{name}: {outcome(name)};" for name in scans), flush=True)
+
+
+def rim(scans: dict[str, int]) -> None:
+    """Where an image ends, which decides the size of a template."""
+    for name in scans:
+        scan, z_um, *_ = images(name)
         found = beads.find_beads(scan, z_um)
         for value in (0.03, 0.06, 0.12):
             with changed(pattern, "RIM", value):
                 print(f"pattern.RIM = {value}: {name}: size {beads._size(scan, found)} px", flush=True)
-        made = Calibration.from_scan(scan, z_um, size=size)
+
+
+def dips(scans: dict[str, int]) -> None:
+    """What separates a depth from an ambiguous one."""
+    for name, size in scans.items():
+        made = Calibration.from_scan(*images(name)[:2], size=size)
         for value in (0.005, 0.01, 0.02, 0.04, 0.08):
             with changed(quality, "DIP", value):
                 other = depth_quality(made)["ambiguous_correlation"]
                 said = ", ".join(f"{(other >= least).mean():.2f} at {least}" for least in (0.9, 0.95, 0.99))
                 print(f"quality.DIP = {value}: {name}: fraction of ambiguous depths {said}", flush=True)
+
+
+def thresholds(scans: dict[str, int]) -> None:
+    """What the threshold is chosen with."""
+    for name, size in scans.items():
+        scan, z_um, frames, *_ = images(name)
+        made = Calibration.from_scan(scan, z_um, size=size)
         for constant, values in {"LOWEST": (0.1, 0.2, 0.3), "DEPTHS": (10, 25, 51)}.items():
             for value in values:
                 with changed(settings, constant, value):
                     threshold = choose_settings(frames, made, method="correlation").threshold
                     print(f"settings.{constant} = {value}: {name}: threshold {threshold:.2f}", flush=True)
+
+
+def spacing(_: dict[str, int]) -> None:
+    """How far the images of a scan may be apart."""
     sample, microscope, rng = datasets.sample(), Microscope(), np.random.default_rng(4)
     grid = np.stack(np.meshgrid(*2 * [np.arange(40, 480, 72)]), axis=-1).reshape(-1, 2)
     true = [
@@ -100,6 +123,19 @@ def main() -> None:
         score = assessment.scores(batch(frames, made, progress=False), pd.concat(true, ignore_index=True), within_um=20)
         least = np.diagonal(made.self_similarity(), 1).min()
         print(f"every {step}: correlation {least:.2f} or more, RMS z {score.sigma_z_um:.2f} um", flush=True)
+
+
+PARTS = {part.__name__: part for part in (beads_found, rim, dips, thresholds, spacing)}
+
+
+def main() -> None:
+    """Do the parts, and use the scans, that are named; all if none is."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", nargs="*", choices=[*PARTS, *SCANS, []], help="parts and scans")
+    what = parser.parse_args().what
+    scans = {name: size for name, size in SCANS.items() if name in what} or SCANS
+    for name in [part for part in PARTS if part in what] or PARTS:
+        PARTS[name](scans)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gdptlab.experiment.channel import Acoustics, Channel, Focusing, Suspension, Trajectories
+from gdptlab.experiment.channel import IN_CHANNEL, Acoustics, Channel, Focusing, Suspension, Trajectories
 from gdptlab.experiment.film import Film
 from gdptlab.tracking.acoustic_energy import fit_energy, imitate
 
@@ -39,7 +39,7 @@ def measured(rng) -> pd.DataFrame:
         stated = std * crowd * rng.lognormal(0, 0.3, n)
         error = stated * rng.standard_t(3, n)  # heavier tails than stated,
         error += std * rng.normal(0, 1, particles)[own] * np.cos(table["frame"] / 30 + own)  # and slow parts
-        table[f"{axis}_um"] += error
+        table[IN_CHANNEL[axis]] += error
         table[f"{axis}_std_um"] = stated
     table["z_um"] += 0.3 * np.sin(table["z_um"] / 12 + rng.uniform(0, 6))  # the calibration's, the same for all
     hops = rng.random(particles) < 0.05  # to another particle's path, at some time
@@ -51,7 +51,7 @@ def measured(rng) -> pd.DataFrame:
     ) + 1000 * (table["frame"] > rng.integers(0, 250, particles)[own])  # broken, half of them
     burst = rng.random(n) < 0.02  # far off, with small standard deviations
     table.loc[burst, "z_um"] += rng.normal(0, 8, burst.sum())
-    table.loc[burst, "y_um"] += rng.normal(0, 1, burst.sum())
+    table.loc[burst, "y_channel_um"] += rng.normal(0, 1, burst.sum())
     return table[rng.random(n) > 0.04]  # missed
 
 
@@ -102,7 +102,7 @@ def test_rows_that_share_their_errors_count_once():
     )
     table["fifth"] = table["frame"] // 5 * 5
     table = table.merge(error.rename(columns={"frame": "fifth"}), on=["fifth", "particle"])
-    table["y_um"] += table["dy"]
+    table["y_channel_um"] += table["dy"]
     all_rows, some = (fit_energy(t, sound(), FPS) for t in (table, table[table["frame"] % 5 == 2]))
     assert all_rows.loc["E_y_J_m3", "std"] > 0.75 * some.loc["E_y_J_m3", "std"]
 
@@ -110,10 +110,10 @@ def test_rows_that_share_their_errors_count_once():
 def test_outliers_hardly_matter():
     rng = np.random.default_rng(11)
     table = paths(rng, mean_in_view=20)
-    table["y_um"] += rng.normal(0, table["y_std_um"])
+    table["y_channel_um"] += rng.normal(0, table["y_std_um"])
     clean = fit_energy(table, sound(), FPS)
     hit = rng.random(len(table)) < 0.05
-    table.loc[hit, "y_um"] = rng.uniform(-90, 90, hit.sum())
+    table.loc[hit, "y_channel_um"] = rng.uniform(-90, 90, hit.sum())
     spoilt = fit_energy(table, sound(), FPS)
     assert abs(spoilt.loc["E_y_J_m3", "value"] / clean.loc["E_y_J_m3", "value"] - 1) < 1e-3
 
@@ -134,7 +134,7 @@ def test_sound_may_be_weak_but_not_absent(seed):
     weak, none = (paths(rng, sound(energy), mean_in_view=15) for energy in (0.01, 1e-9))
     for table in (weak, none):
         for axis, std in (("y", 0.01), ("z", 0.12)):
-            table[f"{axis}_um"] += rng.normal(0, std, len(table))
+            table[IN_CHANNEL[axis]] += rng.normal(0, std, len(table))
     assert fit_energy(weak, sound(), FPS).loc["E_J_m3", "value"] == pytest.approx(0.01, rel=0.01)
     with pytest.raises(ValueError, match=r"^tracks: "):
         fit_energy(none, sound(), FPS)
@@ -172,15 +172,16 @@ def exact(film: Film) -> pd.DataFrame:
 def test_an_imitated_film_has_its_own_paths_and_the_errors_of_the_other():
     film, others = Film.seeded(3, **SHORT), [Film.seeded(k, **SHORT) for k in (4, 5)]
     tracks = exact(film)
-    tracks["y_um"] += 0.4
+    tracks["y_channel_um"] += 0.4
     tracks["z_um"] -= 1.5
     missed = tracks["frame"] == 9
     for other, made in zip(others, imitate(tracks[~missed].reset_index(drop=True), film, others, rng=1), strict=True):
         true = other.to_channel(other.truth())
         assert 9 not in set(made["frame"]) and len(made) > 0.6 * len(true)
-        pairs = made.assign(x=made["x_um"].round(6)).merge(true.assign(x=true["x_um"].round(6)), on=["frame", "x"])
+        made, true = (table.assign(x=table["x_channel_um"].round(6)) for table in (made, true))
+        pairs = made.merge(true, on=["frame", "x"])
         assert len(pairs) == len(made)
-        np.testing.assert_allclose(pairs["y_um_x"] - pairs["y_um_y"], 0.4)
+        np.testing.assert_allclose(pairs["y_channel_um_x"] - pairs["y_channel_um_y"], 0.4)
         np.testing.assert_allclose(pairs["z_um_x"] - pairs["z_um_y"], -1.5)
         assert (pairs.groupby("particle_x")["particle_y"].nunique() == 1).all()
         assert (made["z_std_um"] == 0.2).all()
@@ -188,11 +189,11 @@ def test_an_imitated_film_has_its_own_paths_and_the_errors_of_the_other():
 
 def test_tracks_of_nobody_stay_and_the_seed_decides():
     film, other = Film.seeded(3, **SHORT), Film.seeded(4, **SHORT)
-    ghost = exact(film).iloc[:1].assign(particle=10**6, x_px=-50.0, x_um=-33.0)
+    ghost = exact(film).iloc[:1].assign(particle=10**6, x_px=-50.0, x_channel_um=-33.0)
     tracks = pd.concat([exact(film), ghost], ignore_index=True)
     (made,), (again,), (else_,) = (list(imitate(tracks, film, [other], rng=seed)) for seed in (1, 1, 2))
     pd.testing.assert_frame_equal(made, again)
     assert not made.equals(else_)
-    assert (made["x_um"] == -33.0).sum() == 1
+    assert (made["x_channel_um"] == -33.0).sum() == 1
     with pytest.raises(ValueError, match="x_px"):
         next(imitate(tracks.drop(columns="x_px"), film, [other], rng=1))

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from conftest import table
 
-from gdptlab.assessment import match, scores, scores_by_z, standard_assessment
+from gdptlab.assessment import count_valid, match, scores, scores_by_z, standard_assessment
 
 
 def pairs_of(measured, true, **settings):
@@ -254,3 +254,19 @@ def test_assessment_refuses(changes, error, message):
     arguments = {"locator": locator, "frames": range(2), "true": true} | changes
     with pytest.raises(error, match=message):
         standard_assessment(**arguments)
+
+
+def test_valid_particles_match_a_true_one_of_their_own_frame():
+    true = pd.DataFrame({"frame": [0, 0, 5, 10, 11], "x_px": [10.0, 50, 10, 10, 10], "y_px": 10.0, "z_um": 0.0})
+    measured = true.assign(z_um=[0.0, 30, 1, 0, 0], x_px=[11.0, 50, 10, 400, 10])
+    assert count_valid(measured, true, [0, 5, 10]).tolist() == [1, 1, 0]  # frame 11 is not asked for
+    assert count_valid(measured, true, [0, 5, 10], within_um=31).tolist() == [2, 1, 0]
+    parts = [len(match(measured[measured.frame == k], true[true.frame == k])) for k in (0, 5, 10)]
+    assert count_valid(measured, true, [0, 5, 10]).tolist() == parts
+
+
+@pytest.mark.parametrize("frames", [[5, 0], [[0, 5]], [0.5, 1.0]])
+def test_frames_to_count_in_must_be_increasing_whole_numbers(frames):
+    one = table(1, 2, 3).assign(frame=0)
+    with pytest.raises(ValueError, match="frames"):
+        count_valid(one, one, frames)

@@ -195,3 +195,42 @@ def test_an_outlier_is_left_out(scan) -> None:
     assert beads["verdict"].value_counts()["used"] == 3
     odd = beads[beads["verdict"] == "an outlier"]
     assert len(odd) == 1 and np.hypot(odd["x_px"] - x, odd["y_px"] - y).item() < 5
+
+
+def flowing(radius, speed, n=16):
+    """A film of astigmatic particles at radii (p,) of a vortex; rad a frame."""
+    rows, columns = np.indices((240, 240))
+    z, film = np.linspace(-20, 20, len(radius)), []
+    for k in range(n):
+        angle = 2 * np.arange(len(radius)) + speed * k
+        x, y = 120 + radius * np.cos(angle), 118 + radius * np.sin(angle)
+        wide, high = (2 * np.hypot(1, (z + s) / 14) for s in (9, -9))
+        film.append(
+            sum(
+                9000 / a / b * np.exp(-((columns - c) ** 2) / (2 * a**2) - (rows - d) ** 2 / (2 * b**2))
+                for c, d, a, b in zip(x, y, wide, high, strict=True)
+            )
+        )
+    return np.array(film) + np.random.default_rng(3).normal(0, 6, (n, 240, 240))
+
+
+@pytest.mark.parametrize("field", [False, True])
+@pytest.mark.parametrize(("radius", "speed"), [((20, 60, 60, 95, 95), 0.02), ((30, 80, 80, 60), 0.5), ((60,), 0.03)])
+def test_a_film_is_no_scan(radius, speed, field) -> None:
+    film = flowing(np.array(radius, dtype=float), speed)
+    with pytest.raises(ValueError, match=r"^scan: .*film of particles that flow"):
+        Calibration.from_scan(film, np.arange(len(film)) * 3.0, field=field)
+
+
+@pytest.mark.parametrize("how", ["stack", "bead", "file"])
+def test_every_calibration_is_judged(scan, made, how, tmp_path) -> None:
+    """Those that are not made by `from_scan` have no beads to judge."""
+    made.save(tmp_path / "a.npz")
+    makers = {
+        "stack": lambda: Calibration.from_stack(made.stack, Z_UM),
+        "bead": lambda: Calibration.from_bead(scan, Z_UM, *PLACES[0]),
+        "file": lambda: Calibration.load(tmp_path / "a.npz"),
+    }
+    table = report(makers[how]())
+    assert set(table.index) >= {"signal", "step", "ambiguity", "error of z", "noise of the stack"}
+    assert set(table["verdict"]) <= {"good", "look", "bad"} and "beads" not in table.index

@@ -13,9 +13,10 @@ from references import correlate_plainly
 
 from gdptlab import Calibration, locate
 from gdptlab._plans import KEPT, planned
-from gdptlab.calibration import VERSION, levelled
+from gdptlab.calibration import levelled
 from gdptlab.correlation import normalised
 from gdptlab.denoising import signal_to_noise
+from gdptlab.pipeline.calibration_file import VERSION
 
 CENTRE_PX = 0.1  # mean error of x and y with a calibration cut out of a scan
 CENTRE_Z_UM = 1.0  # likewise of z
@@ -433,7 +434,7 @@ NAN[2, 3, 4], INF[2, 3, 4], FLAT[[1, 4]] = np.nan, np.inf, 7
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"stack": STACK[:, :8, :8]}, ValueError, "^stack:"),
+        ({"stack": STACK[:, :2, :2]}, ValueError, "^stack:"),
         ({"stack": STACK[:, :7]}, ValueError, "^stack:"),
         ({"stack": STACK[0]}, ValueError, "^stack:"),
         ({"stack": STACK[:2], "z_um": [0, 1]}, ValueError, "^stack:"),

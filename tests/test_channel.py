@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
-from gdptlab.experiment.channel import Acoustics, Channel, Focusing, Suspension, Trajectories
+from gdptlab.experiment.channel import IN_CHANNEL, Acoustics, Channel, Focusing, Suspension, Trajectories
 
 PAPER = Focusing()
 RESONANT = Focusing(acoustics=Acoustics(two_half_waves=True))
@@ -107,7 +107,7 @@ def test_trajectories_match_an_integrator(focusing):
     y0, z0 = np.random.default_rng(5).uniform(-1, 1, (2, 12)) * np.array(free)[:, None]
     y0[:2], z0[:2] = [free[0], -free[0]], [-free[1], 0.3 * free[1]]
     x0, name = np.linspace(-50, 80, 12), np.arange(100, 112)
-    start = pd.DataFrame({"particle": name, "x_um": x0, "y_um": y0, "z_um": z0})
+    start = pd.DataFrame({"particle": name, "x_channel_um": x0, "y_channel_um": y0, "z_um": z0})
     times = np.array([0, 0.04, 0.5, 1.7, 4.2, 11.1, 20])
 
     def velocity(_, state):
@@ -119,10 +119,10 @@ def test_trajectories_match_an_integrator(focusing):
     solution = solve_ivp(velocity, (0, 20), np.concatenate([x0, y0, z0]), t_eval=times, **accuracy)
     truth = solution.y.reshape(3, 12, len(times))
     table = Trajectories(focusing=focusing, start=start).table(times, border_um=np.inf)
-    assert list(table.columns) == ["frame", "particle", "t_s", "x_um", "y_um", "z_um"]
+    assert list(table.columns) == ["frame", "particle", "t_s", "x_channel_um", "y_channel_um", "z_um"]
     assert (table["particle"].to_numpy() == np.tile(start["particle"], len(times))).all()
     w, h = focusing.channel.width_um, focusing.channel.height_um
-    for column, expected, extent in zip(["x_um", "y_um", "z_um"], truth, [min(w, h), w, h], strict=True):
+    for column, expected, extent in zip(IN_CHANNEL.values(), truth, [min(w, h), w, h], strict=True):
         got = table[column].to_numpy().reshape(len(times), 12).T
         assert np.abs(got - expected).max() < 1e-6 * extent, column
 
@@ -130,7 +130,7 @@ def test_trajectories_match_an_integrator(focusing):
 def test_instantly_focused_particles_ride_on_the_centre_line():
     loud = Acoustics(energy_density_J_m3=5000, two_half_waves=True)
     film = Trajectories.seeded(Focusing(acoustics=loud), 3)
-    x = [film.positions(t, border_um=np.inf)["x_um"] for t in (0.5, 10.1, 19.9)]
+    x = [film.positions(t, border_um=np.inf)["x_channel_um"] for t in (0.5, 10.1, 19.9)]
     np.testing.assert_allclose(x[1] - x[0], 9.6 * PAPER.channel.max_speed_um_s, rtol=1e-6)
     np.testing.assert_allclose(x[2] - x[1], 9.8 * PAPER.channel.max_speed_um_s, rtol=1e-6)
 
@@ -173,7 +173,7 @@ def test_film_of_20000_particles_triggers_at_the_closed_form():
         exact = film.trigger_time(axis)
         times = exact * np.array([0.98, 1.02])
         seen = film.table(times)
-        focused = (seen[f"{axis}_um"].abs() <= PAPER.extent_um(axis) / 6).groupby(seen["frame"]).mean()
+        focused = (seen[IN_CHANNEL[axis]].abs() <= PAPER.extent_um(axis) / 6).groupby(seen["frame"]).mean()
         assert focused[0] < 0.9 <= focused[1]
 
 
@@ -205,8 +205,8 @@ def test_a_longer_film_begins_with_the_particles_of_a_shorter_one(duration_s):
     for t in (0.0, duration_s):
         one, other = (film.positions(t, border_um=30.0) for film in (short, long))
         assert one["particle"].tolist() == other["particle"].tolist()
-        np.testing.assert_allclose(one["x_um"], other["x_um"], rtol=0, atol=1e-5)
-        pd.testing.assert_frame_equal(one[["y_um", "z_um"]], other[["y_um", "z_um"]], check_exact=True)
+        np.testing.assert_allclose(one["x_channel_um"], other["x_channel_um"], rtol=0, atol=1e-5)
+        pd.testing.assert_frame_equal(one[["y_channel_um", "z_um"]], other[["y_channel_um", "z_um"]], check_exact=True)
 
 
 def test_positions_is_a_row_of_the_table():
@@ -214,8 +214,8 @@ def test_positions_is_a_row_of_the_table():
     table = film.table([0, 3.3, 7], border_um=12)
     at = table[table["frame"] == 1].drop(columns="frame").reset_index(drop=True)
     pd.testing.assert_frame_equal(film.positions(3.3, border_um=12), at, rtol=1e-12)
-    assert at["x_um"].min() < 0 and at["x_um"].max() > film.view_length_um
-    assert film.positions(3.3)["x_um"].between(0, film.view_length_um).all()
+    assert at["x_channel_um"].min() < 0 and at["x_channel_um"].max() > film.view_length_um
+    assert film.positions(3.3)["x_channel_um"].between(0, film.view_length_um).all()
     assert len(film.positions(3.3, border_um=np.inf)) == len(film.start)
 
 
@@ -224,8 +224,8 @@ def test_start_is_even_and_off_the_walls(focusing):
     start = Trajectories.seeded(focusing, 1, mean_in_view=5000).start
     for axis in "yz":
         free = focusing.extent_um(axis) / 2 - focusing.suspension.radius_um
-        assert start[f"{axis}_um"].abs().max() <= free
-        counts = np.histogram(start[f"{axis}_um"], bins=10, range=(-free, free))[0]
+        assert start[IN_CHANNEL[axis]].abs().max() <= free
+        counts = np.histogram(start[IN_CHANNEL[axis]], bins=10, range=(-free, free))[0]
         assert np.abs(counts / len(start) - 0.1).max() < 4 * np.sqrt(0.09 / len(start))
 
 
@@ -234,7 +234,7 @@ def test_density_in_view_does_not_change(focusing):
     """1000 particles in view: each fifth of it holds 200 at any time, to four standard deviations (28 %)."""
     film = Trajectories.seeded(focusing, 6, mean_in_view=1000, view_length_um=250)
     table = film.table([0, 2, 5, 10, 20])
-    fifth = (table["x_um"] // 50).clip(upper=4).astype(int)
+    fifth = (table["x_channel_um"] // 50).clip(upper=4).astype(int)
     counts = table.groupby(["frame", fifth]).size()
     assert len(counts) == 25
     np.testing.assert_allclose(counts, 200, atol=4 * np.sqrt(200))
@@ -244,26 +244,26 @@ def test_each_path_is_seeded_from_far_enough_upstream():
     """Particles evenly spaced on one path over the x that `seeded` uses: the number in view stays, ± 1."""
     drawn = Trajectories.seeded(PAPER, 0, mean_in_view=20_000, view_length_um=100, border_um=10).start
     first, last = -10 - 20 * PAPER.channel.max_speed_um_s, 110
-    assert drawn["x_um"].min() == pytest.approx(first, abs=0.1)
-    assert drawn["x_um"].max() == pytest.approx(last, abs=0.1)
+    assert drawn["x_channel_um"].min() == pytest.approx(first, abs=0.1)
+    assert drawn["x_channel_um"].max() == pytest.approx(last, abs=0.1)
     for y, z in [(0, 0), (97.5, -47.5), (-60, 20)]:
         x = np.arange(first + 0.25, last, 0.5)
-        row = pd.DataFrame({"particle": np.arange(x.size), "x_um": x, "y_um": y, "z_um": z})
+        row = pd.DataFrame({"particle": np.arange(x.size), "x_channel_um": x, "y_channel_um": y, "z_um": z})
         film = Trajectories(focusing=PAPER, start=row, view_length_um=100)
         counts = film.table(np.linspace(0, 20, 50), border_um=10).groupby("frame").size()
         assert counts.between(239, 241).all()
 
 
 def test_start_table_is_copied():
-    start = pd.DataFrame({"particle": [0], "x_um": [1.0], "y_um": [-40.0], "z_um": [20.0]})
+    start = pd.DataFrame({"particle": [0], "x_channel_um": [1.0], "y_channel_um": [-40.0], "z_um": [20.0]})
     film = Trajectories(focusing=PAPER, start=start)
-    start.loc[0, "y_um"] = 0
-    assert film.positions(0)["y_um"].item() == pytest.approx(-40)
+    start.loc[0, "y_channel_um"] = 0
+    assert film.positions(0)["y_channel_um"].item() == pytest.approx(-40)
 
 
 # -------------------- bad input
 
-ONE = pd.DataFrame({"particle": [0], "x_um": [0.0], "y_um": [0.0], "z_um": [0.0]})
+ONE = pd.DataFrame({"particle": [0], "x_channel_um": [0.0], "y_channel_um": [0.0], "z_um": [0.0]})
 NUMBERS = [
     (kind, item.name)
     for kind in (Channel, Suspension, Acoustics)
@@ -302,7 +302,7 @@ VALUE_ERRORS = [
     (lambda: Focusing(suspension=Suspension(compressibility_per_TPa=900)), "contrast_factor"),
     (lambda: PAPER.path("x", 0, 1), "axis"),
     (lambda: PAPER.path("z", [0, -51], 1), "start_um"),
-    (lambda: PAPER.channel.velocity(101, 0), "y_um"),
+    (lambda: PAPER.channel.velocity(101, 0), "y_channel_um"),
     (lambda: PAPER.channel.velocity(0, np.nan), "z_um"),
     (lambda: PAPER.radiation_velocity("y", 101), "position_um"),
     (lambda: PAPER.trigger_time("y", 0), "fraction"),
@@ -324,8 +324,8 @@ VALUE_ERRORS = [
     (lambda: seeded().table(3), "times_s"),
     (lambda: seeded().positions(1, border_um=-3), "border_um"),
     (lambda: given(ONE.assign(z_um=48.0)), "start z_um"),
-    (lambda: given(ONE.assign(x_um=np.nan)), "start x_um"),
-    (lambda: given(ONE.drop(columns="y_um")), "start"),
+    (lambda: given(ONE.assign(x_channel_um=np.nan)), "start x_channel_um"),
+    (lambda: given(ONE.drop(columns="y_channel_um")), "start"),
     (lambda: given(ONE[:0]), "start"),
 ]
 TYPE_ERRORS = [

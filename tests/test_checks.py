@@ -1,6 +1,7 @@
 """Checks of arguments: the message names the argument, what came and what is allowed."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from gdptlab import _checks as check
@@ -82,3 +83,43 @@ def test_real_array_gives_float32_of_any_real_type(dtype):
 def test_real_array_refuses(value, error, message):
     with pytest.raises(error, match=f"^image: .*{message}"):
         check.real_array("image", value, 2)
+
+
+def test_a_table_without_rows_needs_no_types():
+    empty = pd.DataFrame(columns=["frame", "x_px"])
+    assert check.table("a", empty, ["x_px"]) is empty
+    with pytest.raises(TypeError, match=r"^a: .*x_px"):
+        check.table("a", pd.DataFrame({"x_px": ["b"]}), ["x_px"])
+
+
+@pytest.mark.parametrize(
+    ("call", "bad", "error"),
+    [
+        (lambda v: check.instance("a", v, str), 3, TypeError),
+        (lambda v: check.instances("a", v, str), ["b", 3], TypeError),
+        (lambda v: check.instances("a", v, str), None, TypeError),
+        (lambda v: check.iterable("a", v), 3, TypeError),
+        (lambda v: check.function("a", v), 3, TypeError),
+        (lambda v: check.pair("a", v), 3, TypeError),
+        (lambda v: check.pair("a", v), (0, 3), ValueError),
+        (lambda v: check.numbers("a", v, 0, 5), [3, 6], ValueError),
+        (lambda v: check.numbers("a", v), [np.nan], ValueError),
+        (lambda v: check.numbers("a", v), ["b"], TypeError),
+        (lambda v: check.generator("a", v), -1, ValueError),
+        (lambda v: check.generator("a", v), 0.5, TypeError),
+        (lambda v: check.path("a", v), 3, TypeError),
+        (lambda v: check.path("a", v, ".csv"), "b.txt", ValueError),
+        (lambda v: check.processes("a", v), 0, ValueError),
+    ],
+)
+def test_what_is_not_as_it_should_be_is_refused_by_name(call, bad, error):
+    with pytest.raises(error, match=r"^a\b"):
+        call(bad)
+
+
+def test_what_is_as_it_should_be_comes_back():
+    rng = np.random.default_rng(1)
+    assert check.generator("a", rng) is rng and check.generator("a", 1).random() == rng.random()
+    assert check.instances("a", ("b", "c"), str) == ["b", "c"] and check.pair("a", [2, 3]) == (2, 3)
+    assert check.path("a", "b.csv", ".csv").name == "b.csv" and check.processes("a", -1) == -1
+    np.testing.assert_array_equal(check.numbers("a", [[1, 2]], 0, 2), [[1.0, 2.0]])

@@ -115,3 +115,16 @@ def test_one_bead_measures_the_others(beads):
     print(f"found {found:.2f}, RMSE z {rmse:.2f} um, bias {bias:.2f} um")
     assert found >= FOUND
     assert rmse <= RMSE_UM
+
+
+def test_the_astigmatic_bead_is_there_or_the_message_says_where_to_get_it(monkeypatch, tmp_path):
+    try:
+        bead = datasets.astigmatic_bead()
+    except FileNotFoundError as absent:
+        assert "python-microscopy" in str(absent)
+        pytest.skip(str(absent))
+    assert bead.shape == (61, 61, 61) and bead.dtype == np.float32 and bead.max() == 1
+    monkeypatch.setenv("GDPTLAB_DATA", str(tmp_path))
+    monkeypatch.setattr(datasets, "DATA", tmp_path)
+    with pytest.raises(FileNotFoundError, match="GDPTLAB_DATA"):
+        datasets.astigmatic_bead()

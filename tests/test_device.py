@@ -45,12 +45,12 @@ def test_then_only_the_flow_goes_on():
     off = switched(film(), 0.1).trajectories
     a, b, c = (off.positions(t, border_um=np.inf).set_index("particle") for t in (0.1, 0.1 + 0.03, 0.6))
     for later, seconds in ((b, 0.03), (c, 0.5)):
-        assert (later[["y_um", "z_um"]] == a[["y_um", "z_um"]]).all(axis=None)
-        moved = FAST.channel.velocity(a["y_um"], a["z_um"]) * seconds
-        np.testing.assert_allclose(later["x_um"], a["x_um"] + moved)
-    assert c["t_s"].eq(0.6).all() and (c["x_um"] > a["x_um"]).all()
+        assert (later[["y_channel_um", "z_um"]] == a[["y_channel_um", "z_um"]]).all(axis=None)
+        moved = FAST.channel.velocity(a["y_channel_um"], a["z_um"]) * seconds
+        np.testing.assert_allclose(later["x_channel_um"], a["x_channel_um"] + moved)
+    assert c["t_s"].eq(0.6).all() and (c["x_channel_um"] > a["x_channel_um"]).all()
     before = off.positions(0.05, border_um=np.inf).set_index("particle")
-    assert (before["y_um"].abs() > a["y_um"].abs()).all()
+    assert (before["y_channel_um"].abs() > a["y_channel_um"].abs()).all()
 
 
 def test_particles_are_kept_up_to_the_border():
@@ -58,7 +58,7 @@ def test_particles_are_kept_up_to_the_border():
     off = switched(film(), 0.0).trajectories
     everywhere = off.positions(0.6, border_um=np.inf)
     for border in (0.0, 12.5):
-        kept = everywhere["x_um"].between(-border, plain.view_length_um + border)
+        kept = everywhere["x_channel_um"].between(-border, plain.view_length_um + border)
         assert 0 < kept.sum() < len(kept)
         seen = off.positions(0.6, border_um=border)
         pd.testing.assert_frame_equal(seen, everywhere[kept].reset_index(drop=True))

@@ -1,5 +1,8 @@
 """What went wrong without a word, or with one that did not help: each stays mended."""
 
+import subprocess
+import sys
+import time
 import zipfile
 
 import numpy as np
@@ -35,6 +38,38 @@ def test_a_large_offset_costs_no_digits(few, calibration, offset):
     pd.testing.assert_frame_equal(locate(frame + offset, calibration), plain, atol=1e-3)
     made = Calibration.from_stack(stack + offset, calibration.z_um)
     pd.testing.assert_frame_equal(locate(frame, made), plain, atol=1e-3)
+
+
+# -------------------- processes that outlive who started them
+
+ORPHANS = """
+import numpy as np
+from gdptlab import Calibration, batch
+
+y, x = np.indices((9, 9)) - 4
+stack = [np.exp(-((x / (2 + z)) ** 2) - (y / (4 - z)) ** 2) for z in np.linspace(-1, 1, 7)]
+
+def film():
+    for k in range(10**9):
+        if k == 250:
+            print("runs", flush=True)
+        yield np.eye(40)
+
+if __name__ == "__main__":
+    batch(film(), Calibration.from_stack(stack, range(7), n_sub=3), n_jobs=2, progress=False)
+"""
+
+
+def test_processes_of_batch_leave_when_their_parent_is_killed(tmp_path):
+    (tmp_path / "orphans.py").write_text(ORPHANS)
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "orphans.py")], stdout=subprocess.PIPE, text=True)
+    try:
+        assert parent.stdout.readline() == "runs\n"
+    finally:
+        parent.kill()
+    start = time.monotonic()
+    parent.communicate(timeout=60)  # until nobody holds its output open
+    assert time.monotonic() - start < 20
 
 
 # -------------------- files of calibrations

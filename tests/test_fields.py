@@ -175,6 +175,19 @@ def test_files_hold_what_was_written(tmp_path):
     assert arrays["n"].tolist() == [4, 1, 0, 0]  # x is the fastest
 
 
+def test_positions_in_a_channel_are_written_as_others_are(tmp_path):
+    renamed = {"x_um": "x_channel_um", "y_um": "y_channel_um"}
+    save_paraview_tracks(TABLE.rename(columns=renamed), tmp_path / "tracks.pvd")
+    part, arrays = TABLE[TABLE["frame"] == 0], decoded(tmp_path / "tracks" / "000000.vtu")
+    np.testing.assert_array_equal(arrays["Points"], part[["x_um", "y_um", "z_um"]])
+    save_paraview_field(mean_field(TABLE, {"y_um": [-3, 3, 9]}).rename(columns=renamed), tmp_path / "field.vtr")
+    assert decoded(tmp_path / "field.vtr")["y_channel_um"].tolist() == [0, 6]
+    data, _ = napari_tracks(TABLE.rename(columns=renamed), in_um=True)
+    np.testing.assert_array_equal(data, napari_tracks(TABLE, in_um=True)[0])
+    with pytest.raises(ValueError, match=r"^tracks: "):
+        save_paraview_tracks(TABLE.rename(columns={"x_um": "x_px", "y_um": "y_px"}), tmp_path / "px.pvd")
+
+
 def test_axes_may_be_whole_numbers_or_flags(tmp_path):
     field = pd.DataFrame({"x_um": [0, 1, 0, 1], "z_um": [False, False, True, True], "n": range(4)})
     save_paraview_field(field, tmp_path / "field.vtr")

@@ -35,12 +35,6 @@ def test_the_command_writes_tables_and_a_card(short: None, tmp_path) -> None:
     replay.errors(table, 0.1)  # the columns that a replay needs are there
 
 
-def test_valid_particles_match_a_true_one() -> None:
-    true = pd.DataFrame({"frame": [0, 0, 5, 10], "x_px": [10.0, 50, 10, 10], "y_px": 10.0, "z_um": 0.0})
-    measured = true.assign(z_um=[0.0, 30, 1, 0], x_px=[11.0, 50, 10, 400])
-    assert figure5.valid_particles(measured, true, np.array([0, 5, 10])).tolist() == [1, 1, 0]
-
-
 def test_films_that_failed_are_counted_and_not_in_the_quartiles() -> None:
     errors = pd.DataFrame(
         {

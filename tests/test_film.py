@@ -16,10 +16,10 @@ QUIET = Camera(read_noise=0.0)
 SHORT = {"duration_s": 0.4, "mean_in_view": 12, "shape": SHAPE}
 
 
-def film_of(x_um, y_um, z_um, **fields):
+def film_of(x, y, z, **fields):
     """Film of particles at given places, with next to no flow and sound."""
     focusing = Focusing(channel=Channel(flow_rate_ul_h=1e-9), acoustics=Acoustics(energy_density_J_m3=1e-9))
-    start = pd.DataFrame({"x_um": x_um, "y_um": y_um, "z_um": z_um}).assign(particle=range(len(x_um)))
+    start = pd.DataFrame({"x_channel_um": x, "y_channel_um": y, "z_um": z}).assign(particle=range(len(x)))
     view = {"duration_s": 0.2, "view_length_um": SHAPE[1] * 0.65}
     trajectories = Trajectories(focusing=focusing, start=start, **view)
     return Film(trajectories=trajectories, shape=SHAPE, **fields)
@@ -33,8 +33,8 @@ def test_axes_of_frame_and_channel():
     np.testing.assert_allclose(truth["y_px"], [164.5, 164.5 - 60 / 0.65, 164.5 + 33 / 0.65])
     np.testing.assert_allclose(truth["z_um"], [10, -20, 30])
     back = film.to_channel(truth)
-    np.testing.assert_allclose(back["x_um"], [0.325, 50, 100])
-    np.testing.assert_allclose(back["y_um"], [0, -60, 33], atol=1e-12)
+    np.testing.assert_allclose(back["x_channel_um"], [0.325, 50, 100])
+    np.testing.assert_allclose(back["y_channel_um"], [0, -60, 33], atol=1e-12)
     assert "x_std_um" not in back
     measured = film.to_channel(truth.assign(x_std_px=0.1, y_std_px=[0.2, 0.4, 0.0]))
     np.testing.assert_allclose(measured["x_std_um"], 0.065)
@@ -66,7 +66,8 @@ def test_truth_follows_the_trajectories():
     seen = truth[truth["frame"] == 7]
     assert list(film.truth()) == ["frame", "particle", "x_px", "y_px", "z_um"]
     assert seen["particle"].tolist() == expected["particle"].tolist()
-    np.testing.assert_allclose(seen[["x_um", "y_um", "z_um"]], expected[["x_um", "y_um", "z_um"]], atol=1e-9)
+    columns = ["x_channel_um", "y_channel_um", "z_um"]
+    np.testing.assert_allclose(seen[columns], expected[columns], atol=1e-9)
     assert truth["x_px"].between(-0.5, 209.5).all()
 
 

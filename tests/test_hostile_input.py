@@ -6,7 +6,9 @@ A few tries of each function; `GDPTLAB_THOROUGH=1 pytest tests/test_hostile_inpu
 import re
 import tempfile
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -15,15 +17,18 @@ from conftest import THOROUGH
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from gdptlab import Calibration, batch, locate, match
+from gdptlab import Calibration, Preparation, batch, locate, match
 from gdptlab.assessment import scores, scores_by_z
 from gdptlab.datasets import DATA
+from gdptlab.pipeline.errors import with_errors
 from gdptlab.pipeline.images import open_images, open_scan
 from gdptlab.pipeline.quality import report
 from gdptlab.pipeline.settings import choose_settings
 from gdptlab.pipeline.stream import batch_to_parquet
+from gdptlab.pipeline.surface import flattened
 from gdptlab.pipeline.tables import in_um, save_points, save_table
 from gdptlab.tracking import (
+    drift,
     link,
     mean_field,
     mean_squared_displacement,
@@ -31,10 +36,11 @@ from gdptlab.tracking import (
     save_paraview_field,
     save_paraview_tracks,
     velocities,
+    without_drift,
 )
 
 tried = settings(
-    max_examples=2000 if THOROUGH else 60,
+    max_examples=round(2000 * THOROUGH) or 60,
     deadline=None,
     derandomize=not THOROUGH,
     database=None,
@@ -333,6 +339,69 @@ def test_tracks(table, given, rate, window):
         fails_by_name(lambda: save_paraview_tracks(numbered, Path(folder) / "a.pvd", rate), "tracks", "frame_rate_hz")
         fails_by_name(lambda: save_paraview_field(table, Path(folder) / "a.vtr"), "field")
         fails_by_name(lambda: napari_tracks(numbered), "tracks")
+
+
+@tried
+@given(table=tables(), particles=odd | st.lists(st.integers(0, 3), max_size=3), other=tables())
+def test_drift(table, particles, other):
+    numbered = table.assign(particle=np.arange(len(table)) % 2) if isinstance(table, pd.DataFrame) else table
+    found = fails_by_name(lambda: drift(numbered, particles), "tracks", "particles")
+    if found is not None:
+        assert np.isfinite(found[["x_px", "y_px", "z_um"]]).all(axis=None)
+    fails_by_name(lambda: without_drift(table, other if found is None else found), "table", "drift")
+
+
+ROOM = replace(
+    CALIBRATION,
+    report=SimpleNamespace(
+        beads=pd.DataFrame({"x_px": [0, 9, 0, 9, 4, 5.0], "y_px": [0, 0, 9, 9, 4, 2.0], "offset_um": 0.1}).assign(
+            verdict="used"
+        )
+    ),
+)
+
+
+@tried
+@given(table=tables(), cm=odd)
+def test_errors_and_surface(table, cm):
+    with suppress(TypeError, ValueError, AttributeError):
+        table = table.assign(cm=cm)
+    made = fails_by_name(lambda: with_errors(table, CALIBRATION), "table")
+    if made is not None:
+        assert (made[["x_std_px", "y_std_px", "z_std_um"]] >= 0).all(axis=None)
+    flat = fails_by_name(lambda: flattened(table, ROOM), "table")
+    assert flat is None or np.isfinite(flat["z_um"].astype(float)).all()
+
+
+@tried
+@given(factor=odd | st.tuples(odd, odd), side=odd)
+def test_calibrations_changed(factor, side):
+    made = fails_by_name(lambda: CALIBRATION.with_depth_factor(factor), "factor")
+    assert made is None or (np.diff(made.z_um) > 0).all()
+    fails_by_name(lambda: CALIBRATION.one_side(side), "side")
+
+
+PREPARED = ("dark", "flat", "background", "mask", "region", "first", "last", "every")
+
+
+@tried
+@given(frames=arrays(dims=st.sampled_from([3, 3, 3, 2]), side=st.integers(0, 12)) | odd, data=st.data())
+def test_preparation(frames, data):
+    """Odd arguments, images that fit the frames, and such that do not."""
+    shape = np.shape(frames)[1:] if isinstance(frames, np.ndarray) else (9, 9)
+    image = odd | some_images | st.sampled_from([np.ones(shape), np.zeros(shape), np.eye(*(shape or (1,))[:2])])
+    given = data.draw(
+        st.fixed_dictionaries(
+            {},
+            optional=dict.fromkeys(PREPARED[:4], image)
+            | {"region": odd | st.tuples(*4 * [st.integers(0, 9)])}
+            | dict.fromkeys(PREPARED[5:], odd | st.integers(0, 4)),
+        )
+    )
+    prepare = fails_by_name(lambda: Preparation(**given), *PREPARED)
+    if prepare is not None:
+        made = fails_by_name(lambda: np.asarray(prepare(frames)), "frames", "region")
+        assert made is None or (made.ndim == 3 and np.isfinite(made).all())
 
 
 @tried

@@ -498,3 +498,17 @@ def test_batch_reads_files_where_they_are_measured(few, calibration, tmp_path, n
         write(tmp_path / f"{k}.tif", frame)
     measured = batch(open_images(tmp_path), calibration, n_jobs=n_jobs, progress=False)
     pd.testing.assert_frame_equal(measured, batch(frames, calibration, progress=False), check_exact=True)
+
+
+def test_a_stage_that_stood_still_is_averaged(tmp_path) -> None:
+    """Its encoder reads a little more or less."""
+    z_um = [-4.01, -3.99, -4.0, -2, 0, 2, 4.02, 3.98]
+    scan = np.random.default_rng(5).integers(0, 4000, (8, 9, 11), dtype=np.uint16)
+    tifffile.imwrite(tmp_path / "scan.tif", scan, photometric="minisblack")
+    pd.DataFrame({"z_um": z_um}).to_csv(tmp_path / "z.csv")
+    with pytest.warns(UserWarning, match=r"^csv: the stage stood still at -4 µm in 3 images and at 4.02 µm in 2"):
+        images, depths = open_scan(tmp_path / "scan.tif", csv=tmp_path / "z.csv")
+    np.testing.assert_allclose(depths, [-4, -2, 0, 2, 4], atol=1e-9)
+    np.testing.assert_allclose(images[0], scan[:3].mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(images[-1], scan[6:].mean(axis=0), rtol=1e-6)
+    np.testing.assert_array_equal(images[1:-1], scan[3:6])

@@ -24,7 +24,14 @@ SMALL = {
     "05": {"densities": (25.0,), "sizes_px": (31,), "n_films_last": 1, "n_films": 1, "phases": 1, "watched_s": 3.0},
     "06": {"watched_s": 3.0, "phases": 1},
     "06b": {"n_films_accuracy": 1, "until_s": 0.6, "phases": 1},
-    "07": {"n_subs": (4, 9), "counts": (10,), "sizes_px": (31,), "frames_px": (256,), "frames_scikit_px": (256,)}
+    "07": {
+        "n_subs": (4, 9),
+        "counts": (10,),
+        "sizes_px": (31,),
+        "frames_px": (256,),
+        "frames_opencv_px": (256,),
+        "frames_scikit_px": (256,),
+    }
     | {"rounds": 1, "film_s": 0.4, "processes": (1,), "point_s": 0.01},
     "08": {
         "counts": (10, 50),
@@ -37,7 +44,7 @@ SMALL = {
     "08b": {"counts": (50,), "n_frames": 1, "n_isolated": 1, "film_s": 4.0, "n_films": 1, "every": 25},
     "09": {"n_others": 1, "n_jobs": 1, "modes": 0},
     "10": {"n_beads": 4, "n_frames": 2, "crowds": (25,), "noises": (38.0,), "n_crowded": 2},
-    "11": {"duration_s": 3.0, "factors": (1,), "n_films": 3, "n_jobs": 1},
+    "11": {"duration_s": 3.0, "factors": (1,), "n_films": 3, "n_measured": 1, "measured_s": 2.0, "n_jobs": 1},
     "12": {"rate_s": 1.0, "fast_s": 0.5, "flood_s": 0.5, "n_loops": 1, "n_joint": 3, "ahead": 25},
 }
 """Settings of size, by the number of the notebook."""

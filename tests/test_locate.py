@@ -4,15 +4,18 @@ Accuracy is held against the project's budgets, with noise in the calibration im
 are those of conftest.
 """
 
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import CALIBRATION_SEED, IMAGE_TYPES, SIZE_PX, Z_UM, on_grid, table
+from conftest import CALIBRATION_SEED, IMAGE_TYPES, SIZE_PX, THOROUGH, Z_UM, on_grid, table
 
 from gdptlab import Calibration, batch, locate, match
 from gdptlab.assessment import scores
-from gdptlab.locate import BLOCK, COLUMNS, _refined
+from gdptlab.locate import BLOCK, COLUMNS, _refined, _sides
 
 # Isolated particles, the dimmest with a peak of ten times the read noise.
 RECALL, PRECISION = 0.99, 0.97
@@ -721,6 +724,55 @@ def test_joint_batch_begins_each_frame_with_the_last(few, stacks, calibration):
     pd.testing.assert_frame_equal(one, two, check_exact=True)
     with pytest.raises(ValueError, match=r"^n_jobs:"):
         batch(frames, calibration, n_jobs=2, method="joint")
+
+
+# -------------------- large frames, in tiles
+
+
+@pytest.mark.parametrize(("shape", "half_resolution"), [((1023, 900), True), ((500, 1101), False)])
+def test_tiles_make_no_difference(microscope, stacks, shape, half_resolution, monkeypatch):
+    monkeypatch.setattr(sys.modules["gdptlab.calibration"], "LOSSLESS", 0.98 if half_resolution else 2.0)
+    calibration = Calibration.from_stack(stacks["fluorescent"], Z_UM)
+    assert calibration.half_resolution == half_resolution
+    rng = np.random.default_rng(7)
+    n = shape[0] * shape[1] // 4000  # a crowd, so that many candidates are near to each other and to the tiles' borders
+    y, x, z = rng.uniform((0, 0, -50), (*shape, 50), (n, 3)).T
+    frame = microscope.render(table(x, y, z), shape, rng=rng)
+    for refine in (True, False):
+        monkeypatch.setattr(sys.modules["gdptlab.locate"], "TILE_PX", 10_000)
+        whole = locate(frame, calibration, refine=refine).sort_values(["y_px", "x_px"], ignore_index=True)
+        monkeypatch.setattr(sys.modules["gdptlab.locate"], "TILE_PX", 300)
+        assert len(_sides(max(shape), SIZE_PX)) > 3
+        tiled = locate(frame, calibration, refine=refine).sort_values(["y_px", "x_px"], ignore_index=True)
+        assert len(whole) > n / 4
+        # Rounding: the mean of the tile is subtracted, or that of the frame; transforms have other lengths.
+        pd.testing.assert_frame_equal(tiled, whole, rtol=0, atol=1e-5 if refine else 1e-3)
+
+
+@pytest.mark.parametrize("length", range(301, 320))
+def test_tiles_cover_a_side_and_overlap(length, monkeypatch):
+    monkeypatch.setattr(sys.modules["gdptlab.locate"], "TILE_PX", 120)
+    first, end, low, high = map(np.array, zip(*_sides(length, 15), strict=True))
+    assert first[0] == 0 and end[-1] == length and (first % 2 == 0).all() and len(set(end - first)) == 1
+    assert low[0] == -np.inf and high[-1] == np.inf and (low[1:] == high[:-1]).all()
+    assert (low[1:] - first[1:] >= 7 + 16).all() and (end[:-1] - high[:-1] >= 7 + 16).all()
+
+
+@pytest.mark.skipif(not THOROUGH, reason="takes half a minute: GDPTLAB_THOROUGH=1")
+@pytest.mark.skipif(sys.platform == "win32", reason="resource is of Unix")
+def test_memory_of_a_large_frame():
+    code = """
+import resource, sys
+import numpy as np
+from gdptlab import Calibration, datasets, locate
+sample = datasets.sample()
+calibration = Calibration.from_stack(sample.stack, sample.z_um)
+frame = np.tile(sample.frames[0], (16, 16))
+assert len(locate(frame, calibration)) > 10_000
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2))
+"""
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert float(said) < 600  # MB, of which the frame is 134
 
 
 def test_a_distance_beyond_all_leaves_the_best(few, calibration):

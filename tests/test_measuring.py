@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import tifffile
 
+from gdptlab import Calibration
 from gdptlab.__main__ import BAD, main
 from gdptlab.assessment import match
 from gdptlab.pipeline import measure
@@ -74,6 +75,49 @@ def test_the_film_is_measured_and_linked(folder, measured):
     assert not measured.bad
 
 
+def test_errors_of_correlation_are_in_the_tables(measured):
+    assert {"x_std_px", "y_std_px", "z_std_um", "x_std_um"} <= set(measured.particles)
+    assert {"x_std_um", "y_std_um", "vx_std_um_s"} <= set(measured.tracks)
+
+
+def test_a_scan_is_calibrated_once(folder, measured, monkeypatch):
+    """The second film of a scan takes the calibration, and what is said of the beads, from the cache."""
+    monkeypatch.setattr("gdptlab.pipeline.beads.averaged_beads", None)
+    again = measure(folder / "scan", folder / "film.tif", folder / "again", **CHOICES)
+    pd.testing.assert_frame_equal(again.quality, measured.quality)
+    pd.testing.assert_frame_equal(again.calibration.report.beads, measured.calibration.report.beads)
+    pd.testing.assert_frame_equal(again.calibration.report.settings, measured.calibration.report.settings)
+    pd.testing.assert_frame_equal(again.tracks, measured.tracks)
+
+
+def test_prepared_frames_depth_factor_and_side(folder, measured, capsys):
+    """A dark image, a part of the film and of the frame: the same particles, at 1.33 times the depth."""
+    out = folder / "prepared"
+    tifffile.imwrite(folder / "dark.tif", np.full((240, 240), 90, np.uint16), photometric="minisblack")
+    arguments = ["measure", str(folder / "scan"), str(folder / "film.tif"), "--out", str(out), "--rate", str(RATE)]
+    arguments += ["--size", "31", "--method", "correlation", "--indices", "1", "1.33"]
+    arguments += ["--background", str(folder / "dark.tif"), "--region", "10", "0", "240", "240", "--frames", "1", "15"]
+    assert main([*arguments, "--every", "2"]) in (0, BAD)
+    table, before = pd.read_csv(out / "particles.csv"), measured.particles
+    assert sorted(table["frame"].unique()) == list(range(1, 16, 2))
+    before = before[before["frame"].isin(table["frame"])].assign(z_um=lambda t: 1.33 * t["z_um"])
+    pairs = match(table, before.reset_index(drop=True), within_px=0.1, within_um=0.5)
+    assert len(pairs) > 0.95 * len(before)
+    note = json.loads((out / "particles.csv.json").read_text())
+    assert note["depth_factor"] == 1.33 and note["settings"]["prepare"]["region"] == [10, 0, 240, 240]
+    assert Calibration.load(out / "calibration.npz").depth_factor == 1.33
+    tracks = pd.read_csv(out / "tracks.csv")
+    radius = np.hypot(tracks["x_um"] - 60, tracks["y_um"] - 59)
+    speed = np.hypot(tracks["vx_um_s"], tracks["vy_um_s"])
+    np.testing.assert_allclose(speed.dropna(), 1.5 * radius[speed.notna()], rtol=0.1, atol=2)
+
+
+def test_a_film_given_as_a_scan_is_refused(folder, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        main(["measure", str(folder / "film.tif"), str(folder / "film.tif"), "--z", "0", "30", "--size", "31"])
+    assert leaving.value.code == 2 and "film of particles that flow" in capsys.readouterr().err
+
+
 def test_what_is_in_the_folder(folder, measured):
     names = {path.name for path in measured.folder.iterdir()}
     assert names == {
@@ -85,6 +129,9 @@ def test_what_is_in_the_folder(folder, measured):
             "tracks.csv.json",
             "tracks.pvd",
             "tracks",
+            "field.csv",
+            "field.csv.json",
+            "field.vtr",
         ),
         *("points_napari.csv", "quality.csv", "settings.csv", "calibration.npz", "frames", "log.json", "call.json"),
     }
@@ -144,6 +191,8 @@ def test_results_lie_beside_the_film_unless_told(folder):
         ({"folder": "scan"}, ValueError, "folder"),
         ({"folder": "film.tif"}, ValueError, "folder"),
         ({"colour": "red"}, TypeError, "choices"),
+        ({"cells": 3}, TypeError, "cells"),
+        ({"prepare": "dark"}, TypeError, "prepare"),
     ],
 )
 def test_bad_arguments(folder, monkeypatch, changes, error, name):

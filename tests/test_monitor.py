@@ -1,7 +1,9 @@
 """The loop by hand: a camera that waits for the test, an evaluator that waits for the test. No clock decides."""
 
+import gc
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -15,6 +17,7 @@ from queue import Queue
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import THOROUGH
 
 from gdptlab import locate
 from gdptlab.experiment import replay
@@ -220,9 +223,9 @@ def test_actions_are_called_when_the_state_changes_and_only_then():
 def test_the_middle_third_is_that_of_the_replay():
     rng, channel = np.random.default_rng(0), Channel(width_um=90, height_um=60)
     table = pd.DataFrame({"y": rng.uniform(-45, 45, 40), "z_um": rng.uniform(-30, 30, 40)})
-    expected = replay.fractions(table.rename(columns={"y": "y_um"}).assign(frame=0), [0], channel).iloc[0]
+    expected = replay.fractions(table.rename(columns={"y": "y_channel_um"}).assign(frame=0), [0], channel).iloc[0]
     for of in "hw":
-        fraction = MiddleThird(of=of, channel=channel, to_channel=lambda t: t.assign(y_um=t["y"]))
+        fraction = MiddleThird(of=of, channel=channel, to_channel=lambda t: t.assign(y_channel_um=t["y"]))
         assert fraction(table) == expected[f"fraction_{of}"] > 0.1
         assert np.isnan(fraction(table[:0]))
 
@@ -232,7 +235,7 @@ def test_both_thirds_convert_a_table_once():
 
     def to_channel(table):
         calls.append(len(table))
-        return table.assign(y_um=table["y"])
+        return table.assign(y_channel_um=table["y"])
 
     thirds = middle_thirds(channel, to_channel)
     for rows in (3, 2):
@@ -603,21 +606,62 @@ with Monitor((image(0.5) for _ in itertools.count()), ten, log=sys.argv[1]) as m
 
 
 def test_a_killed_monitor_leaves_a_log_that_can_be_read(tmp_path):
-    path = tmp_path / "log"
-    command = [sys.executable, "-c", ENDLESS, str(path), str(Path(__file__).parent)]
-    process = subprocess.Popen(command)
-    try:
-        until(lambda: (path.exists() and path.stat().st_size > 50_000) or process.poll() is not None)
-        assert process.poll() is None
-    finally:
-        process.kill()  # -9
-        process.wait()
-    lines = path.read_bytes().split(b"\n")
-    assert all(json.loads(line) for line in lines[:-1])  # all but the last, at most
-    frames, particles = read_log(path)
-    assert len(frames) > 50 and frames["frame"].is_monotonic_increasing
-    assert (frames["frame"].diff().dropna() - 1 == frames["dropped"][1:]).all()  # none is missing
-    assert len(particles) == 10 * len(frames)
+    rng = random.Random(1)
+    for kill in range(round(100 * THOROUGH) or 1):
+        path = tmp_path / f"log{kill}"
+        command = [sys.executable, "-c", ENDLESS, str(path), str(Path(__file__).parent)]
+        process = subprocess.Popen(command)
+        try:
+            until(lambda path=path, process=process: grown(path) or process.poll() is not None)
+            time.sleep(rng.uniform(0, 0.2))
+            assert process.poll() is None
+        finally:
+            process.kill()  # -9
+            process.wait()
+        lines = path.read_bytes().split(b"\n")
+        assert all(json.loads(line) for line in lines[:-1])  # all but the last, at most
+        frames, particles = read_log(path)
+        assert len(frames) > 50 and frames["frame"].is_monotonic_increasing
+        assert (frames["frame"].diff().dropna() - 1 == frames["dropped"][1:]).all()  # none is missing
+        assert len(particles) == 10 * len(frames)
+
+
+def grown(path):
+    """Whether there are some hundred lines in a log."""
+    return path.exists() and path.stat().st_size > 50_000
+
+
+def resident_mb():
+    """Memory that this process takes now."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 2**20
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux tells the memory of the moment")
+def test_memory_is_flat(tmp_path):
+    """An hour of a camera at 25 frames/s (a minute, if not thorough), but each frame as soon as the last is done."""
+    number, calls, taken, done = round(90_000 * THOROUGH) or 1500, [], {}, threading.Semaphore(1)
+
+    def camera():
+        for k in range(number):
+            assert done.acquire(timeout=60)
+            if k in (number // 3, number - 1):
+                taken[k] = resident_mb()
+            frame = np.zeros((200, 300), np.uint16)  # 0.1 MB
+            frame[0, 0] = 9 if k // 50 % 2 else 1
+            yield Frame(frame, k / 25)
+
+    def evaluate(frame):
+        done.release()
+        return ten(frame)
+
+    with Monitor(camera(), evaluate, [trigger(calls=calls)], log=tmp_path / "log") as monitor:
+        assert monitor.wait(36_000)
+    status, (early, late) = monitor.status(), taken.values()
+    print(f"{number} frames, {number / 25:.0f} s of a camera; {early:.1f} MB after a third, {late:.1f} MB at the end")
+    assert status.evaluated + status.dropped == number and status.failed == status.log_lost == 0
+    assert len(calls) >= number // 50 - 5
+    assert late - early < 10
 
 
 # -------------------- a process of its own

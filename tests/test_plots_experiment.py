@@ -58,7 +58,7 @@ def test_figure_4_draws_every_particle_of_the_view_at_each_instant() -> None:
     figure = plots.fig4_acoustophoresis(trajectories, trajectories, {"start": 0, "later": 2.5})
     for panel, t in zip(figure.subfigs[1].get_axes(), (0, 2.5), strict=True):
         here = trajectories.positions(t)
-        np.testing.assert_array_equal(panel.get_lines()[0].get_xydata(), here[["y_um", "z_um"]])
+        np.testing.assert_array_equal(panel.get_lines()[0].get_xydata(), here[["y_channel_um", "z_um"]])
     shown = texts(figure)
     assert all(word in shown for word in ("w = 200 µm", "h = 100 µm", "later: 2.5 s", "x (µm), downstream"))
     assert f"{len(trajectories.start)} paths" in shown
@@ -96,6 +96,18 @@ def test_error_against_tau(points: pd.DataFrame) -> None:
     band = replay.expected_delay([0.04, 1, 5])
     figure = plots.error_against_tau(points, band, by="evaluator")
     assert {"gdptlab", "OpenCV"} <= {t.get_text() for t in figure.axes[2].get_legend().get_texts()}
+
+
+def test_three_answers_draw_what_they_are_given(points: pd.DataFrame) -> None:
+    slower = points[points["evaluator"] == "gdptlab"].drop_duplicates(["trigger", "tau_s"])
+    change = pd.DataFrame({"setting": "a", "trigger": ["h", "w"], "mean": [0.1, 0.0], "low": -0.2, "high": 0.3})
+    columns = ["fraction_h", "fraction_w", "true_fraction_h", "true_fraction_w", "valid"]
+    seen = pd.DataFrame(np.linspace(0, 1, 10).reshape(2, 5), columns=columns, index=[0.0, 1.0])
+    figure = plots.three_answers(slower, change, seen, 0.9, {"here": 1.0}, ("none", "little", "there"))
+    shown = texts(figure)
+    assert all(word in shown for word in ("What does refinement buy?\nlittle", "here ", "valid, of the true"))
+    right = figure.axes[0].get_lines()[0].get_ydata()
+    assert list(right) == list(100 - 100 * slower[slower["trigger"] == "h"].sort_values("tau_s")["failed"])
 
 
 def test_an_animation_shows_each_moment(film: Film, monitor: pd.DataFrame, tmp_path: Path) -> None:

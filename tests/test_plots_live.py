@@ -24,7 +24,7 @@ def nothing_left_open():
 
 
 def to_channel(table):
-    return table.assign(y_um=table["y_px"] - 30)
+    return table.assign(y_channel_um=table["y_px"] - 30)
 
 
 def seen(image):

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from gdptlab import plots
-from gdptlab.experiment.channel import Acoustics, Channel, Focusing
+from gdptlab.experiment.channel import IN_CHANNEL, Acoustics, Channel, Focusing
 from gdptlab.experiment.film import Film
 from gdptlab.plots.style import MARK
 
@@ -30,8 +30,8 @@ def moving(film) -> pd.DataFrame:
     """Exact tracks and velocities."""
     table = film.to_channel(film.truth())
     focusing = film.trajectories.focusing
-    speeds = {"x": focusing.channel.velocity(table.y_um, table.z_um)}
-    speeds |= {axis: focusing.radiation_velocity(axis, table[f"{axis}_um"]) for axis in "yz"}
+    speeds = {"x": focusing.channel.velocity(table.y_channel_um, table.z_um)}
+    speeds |= {axis: focusing.radiation_velocity(axis, table[IN_CHANNEL[axis]]) for axis in "yz"}
     for k, axis in enumerate("xyz"):
         table[f"{axis}_std_um"], table[f"v{axis}_um_s"], table[f"v{axis}_std_um_s"] = 0.1 * (k + 1), speeds[axis], 0.5
     return table
@@ -45,7 +45,7 @@ def test_tracks_end_where_particles_are_and_show_no_future(film, moving):
     ends = {tuple(line.get_xydata()[-1].round(6)) for line in frame.get_lines()[: moving.particle.nunique()]}
     assert {tuple(place) for place in now[["x_px", "y_px"]].round(6).to_numpy()} <= ends
     begin = moving.groupby("particle").first()
-    np.testing.assert_allclose(section.collections[0].get_offsets(), begin[["y_um", "z_um"]])
+    np.testing.assert_allclose(section.collections[0].get_offsets(), begin[["y_channel_um", "z_um"]])
     np.testing.assert_allclose(section.collections[0].get_array(), begin["z_um"])
     assert bar.get_ylabel() == "z at the start (µm)" and frame.get_title(loc="left") == "t = 0.24 s"
 
@@ -55,7 +55,7 @@ def test_one_track_has_its_axes_and_its_truth(moving):
     figure = plots.one_track(path.iloc[::2], path, FPS)
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels == ["x (µm)", "y (µm)", "z (µm)", "$v_x$ (µm/s)", "$v_y$ (µm/s)", "$v_z$ (µm/s)"]
-    for axes, name in zip(figure.axes, ["x_um", "y_um", "z_um", "vx_um_s", "vy_um_s", "vz_um_s"], strict=True):
+    for axes, name in zip(figure.axes, [*IN_CHANNEL.values(), "vx_um_s", "vy_um_s", "vz_um_s"], strict=True):
         true, seen = axes.get_lines()
         np.testing.assert_allclose(true.get_ydata(), path[name])
         np.testing.assert_allclose(seen.get_ydata(), path[name].iloc[::2])

@@ -132,7 +132,11 @@ def test_expected_delay_of_known_cases():
 def test_fractions_count_the_middle_thirds():
     channel = Channel(width_um=120, height_um=60)  # middle thirds to 20 and 10
     table = pd.DataFrame(
-        {"frame": [3, 3, 3, 7, 9], "y_um": [-20.0, 20.1, 0.0, 5.0, 0.0], "z_um": [10.0, -10.0, -10.1, 30.0, 0.0]}
+        {
+            "frame": [3, 3, 3, 7, 9],
+            "y_channel_um": [-20.0, 20.1, 0.0, 5.0, 0.0],
+            "z_um": [10.0, -10.0, -10.1, 30.0, 0.0],
+        }
     )
     out = fractions(table, [3, 5, 7], channel)
     assert out["count"].tolist() == [3, 0, 1]
@@ -416,8 +420,8 @@ def test_arguments_of_sweeps_that_cannot_be():
         (lambda: expected_delay(0.0), "tau_s"),
         (lambda: expected_delay(0.1, 0.0), "camera_s"),
         (lambda: expected_delay(0.1, 0.1, 0.04), "truth_s"),
-        (lambda: fractions(pd.DataFrame({"frame": [1]}), [1], Channel()), "y_um"),
-        (lambda: fractions(pd.DataFrame(columns=["frame", "y_um", "z_um"]), [1, 1], Channel()), "frames"),
+        (lambda: fractions(pd.DataFrame({"frame": [1]}), [1], Channel()), "y_channel_um"),
+        (lambda: fractions(pd.DataFrame(columns=["frame", "y_channel_um", "z_um"]), [1, 1], Channel()), "frames"),
         (lambda: errors(pd.DataFrame(columns=["frame", "tau_s"]), phases=0), "phases"),
         (lambda: errors(pd.DataFrame(columns=["frame", "tau_s"]), limit_s=0), "limit_s"),
     ],

@@ -241,7 +241,9 @@ batch_to_parquet(film, Calibration.load(made), folder, n_jobs=int(n_jobs), progr
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no groups of processes to kill")
 @pytest.mark.parametrize(
     ("method", "n_jobs", "kills", "repeats"),
-    [("correlation", 2, 10, 40), ("joint", 1, 10, 10)] if THOROUGH else [("correlation", 1, 2, 6)],
+    [("correlation", 2, round(90 * THOROUGH), 5 + round(120 * THOROUGH)), ("joint", 1, 10, 10)]
+    if THOROUGH
+    else [("correlation", 1, 2, 6)],
 )
 def test_killed_at_random(film, made, tmp_path, method, n_jobs, kills, repeats):
     """By kill -9, wherever it is, with the processes it has started."""

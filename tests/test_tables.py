@@ -63,9 +63,10 @@ def test_save_table(calibration, few, tmp_path, suffix):
         "threshold": 0.5,
         "refine": True,
         "min_distance_px": None,
+        "side": None,
         "sample": "beads",
     }
-    assert note["calibration"] == fingerprint(calibration)
+    assert note["calibration"] == fingerprint(calibration) and note["depth_factor"] == 1
     assert note["versions"] == gdptlab.versions()
     assert len(list(tmp_path.iterdir())) == 2
 

@@ -5,8 +5,9 @@ import pandas as pd
 import pytest
 
 from gdptlab import Calibration, batch
-from gdptlab.experiment.channel import Channel, Focusing, Trajectories
+from gdptlab.experiment.channel import IN_CHANNEL, Channel, Focusing, Trajectories
 from gdptlab.experiment.film import Film
+from gdptlab.tracking import tracks
 from gdptlab.tracking.tracks import identify, link, link_scores, velocities
 
 FPS = 20.0
@@ -14,11 +15,12 @@ CHANNEL = Channel(width_um=180, height_um=90, flow_rate_ul_h=40)  # 1.4 mm/s on 
 STILL = Channel(width_um=180, height_um=90, flow_rate_ul_h=1e-6)
 
 
-def carried(x_um, y_um, z_um, frames=12) -> pd.DataFrame:
+def carried(x, y, z, frames=12) -> pd.DataFrame:
     """Particles that the flow carries, from where they are at frame 0; `true` is their number."""
-    start = pd.DataFrame({"x_um": x_um, "y_um": y_um, "z_um": z_um}, dtype=float).rename_axis("true").reset_index()
-    speed = CHANNEL.velocity(start.y_um, start.z_um)
-    parts = [start.assign(frame=k, x_um=start.x_um + speed * k / FPS) for k in range(frames)]
+    start = pd.DataFrame(dict(zip(IN_CHANNEL.values(), (x, y, z), strict=True)), dtype=float)
+    start = start.rename_axis("true").reset_index()
+    speed = CHANNEL.velocity(start.y_channel_um, start.z_um)
+    parts = [start.assign(frame=k, x_channel_um=start.x_channel_um + speed * k / FPS) for k in range(frames)]
     return pd.concat(parts, ignore_index=True)
 
 
@@ -35,7 +37,7 @@ def noisy_paths(seed=3, mean_in_view=100, duration_s=2.0, missed=0.03) -> tuple[
     table = true[rng.random(len(true)) > missed].reset_index(drop=True)
     for axis, std in zip("xyz", (0.02, 0.03, 0.2), strict=True):
         table[f"{axis}_std_um"] = std * rng.uniform(0.5, 2, len(table))
-        table[f"{axis}_um"] += rng.normal(0, table[f"{axis}_std_um"])
+        table[IN_CHANNEL[axis]] += rng.normal(0, table[f"{axis}_std_um"])
     return table.rename(columns={"particle": "true"}), true, paths.focusing
 
 
@@ -67,8 +69,8 @@ def test_gaps_are_bridged_up_to_memory(missed, n):
 
 @pytest.mark.parametrize("axis", "xyz")
 def test_search_range_is_of_each_axis(axis):
-    table = pd.DataFrame({"frame": range(12), "x_um": 3.0, "y_um": 10.0, "z_um": -20.0})
-    table.loc[table.frame >= 6, f"{axis}_um"] += 2.0
+    table = pd.DataFrame({"frame": range(12), "x_channel_um": 3.0, "y_channel_um": 10.0, "z_um": -20.0})
+    table.loc[table.frame >= 6, IN_CHANNEL[axis]] += 2.0
     limits = {2.2: 1, 1.8: 2}
     for limit, n in limits.items():
         for others in (0.5, 2.5, 9.0):
@@ -84,7 +86,7 @@ def test_search_range_is_of_each_axis(axis):
 def test_short_tracks_are_left_out_and_numbers_have_no_holes():
     table = pd.concat([carried([0], [50], [0], frames=4), carried([0], [-50], [5])]).assign(particle=99, cm=0.9)
     tracks = link(table, predictor=CHANNEL, frame_rate_hz=FPS, min_rows=5)
-    assert len(tracks) == 12 and (tracks.particle == 0).all() and (tracks.y_um == -50).all()
+    assert len(tracks) == 12 and (tracks.particle == 0).all() and (tracks.y_channel_um == -50).all()
     assert link(table, predictor=CHANNEL, frame_rate_hz=FPS, min_rows=4).particle.unique().tolist() == [0, 1]
     assert (tracks.cm == 0.9).all()  # what else is known of a particle stays
 
@@ -109,7 +111,7 @@ def test_nothing_is_said_and_the_table_stays_as_it_was(capfd, caplog):
 
 
 def test_outside_the_channel_the_flow_is_that_of_the_wall():
-    table = pd.DataFrame({"frame": range(12), "x_um": 5.0, "y_um": 91.0, "z_um": -46.0})
+    table = pd.DataFrame({"frame": range(12), "x_channel_um": 5.0, "y_channel_um": 91.0, "z_um": -46.0})
     assert link(table, predictor=CHANNEL, frame_rate_hz=FPS).particle.tolist() == [0] * 12
 
 
@@ -184,11 +186,22 @@ def test_positions_in_px_are_linked_as_they_are():
 def test_a_table_that_is_not_of_the_channel_is_refused():
     """Its origin is the first pixel, not the middle of the channel."""
     table = carried([0, 5, 9, 30], [-60, -20, 20, 70], [0, 10, 20, -20])
-    assert len(link(table, predictor=CHANNEL, frame_rate_hz=FPS)) == len(table)
-    with pytest.raises(ValueError, match=r"^table: .*y_um"):
-        link(table.assign(y_um=table["y_um"] + 90), predictor=CHANNEL, frame_rate_hz=FPS)
+    tracks = link(table, predictor=CHANNEL, frame_rate_hz=FPS)
+    assert len(tracks) == len(table)
+    in_um = table.rename(columns={"x_channel_um": "x_um", "y_channel_um": "y_um"})
+    with pytest.raises(ValueError, match=r"^table: .*y_channel_um"):
+        link(in_um, predictor=CHANNEL, frame_rate_hz=FPS)
+    # Who has both is understood: where particles are expected is in the channel, whatever x_um and y_um are.
+    both = table.assign(x_um=0.0, y_um=np.arange(len(table)))
+    assert partition(link(both, predictor=CHANNEL, frame_rate_hz=FPS)) == partition(tracks)
     with pytest.raises(TypeError, match=r"^frame_rate_hz: "):
         link(table, predictor=CHANNEL)
+
+
+def test_columns_of_the_channel_are_named_alike_in_both_rooms():
+    assert list(IN_CHANNEL.values()) == tracks.IN_CHANNEL
+    film = Film.seeded(1, mean_in_view=5, duration_s=0.1, shape=(310, 200))
+    assert set(tracks.IN_CHANNEL) <= set(film.to_channel(film.truth()))
 
 
 # -------------------- velocities
@@ -231,8 +244,8 @@ def test_standard_deviations_of_velocities_are_true():
     table, true, focusing = noisy_paths(missed=0.1)
     found = velocities(table.rename(columns={"true": "particle"}), 25)
     found = found.merge(true, on=["frame", "particle"], suffixes=("", "_true")).dropna()
-    expected = {"x": focusing.channel.velocity(found.y_um_true, found.z_um_true)}
-    expected |= {axis: focusing.radiation_velocity(axis, found[f"{axis}_um_true"]) for axis in "yz"}
+    expected = {"x": focusing.channel.velocity(found.y_channel_um_true, found.z_um_true)}
+    expected |= {axis: focusing.radiation_velocity(axis, found[f"{IN_CHANNEL[axis]}_true"]) for axis in "yz"}
     for axis, value in expected.items():
         over = (found[f"v{axis}_um_s"] - value) / found[f"v{axis}_std_um_s"]
         assert 0.8 < over.std() < 1.1 and abs(over.mean()) < 0.1  # a little below 1: they are never made smaller

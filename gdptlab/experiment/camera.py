@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gdptlab._checks import positive
+from gdptlab._checks import generator, positive, real_array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +52,9 @@ class Camera:
         -------
         uint16 array (rows, columns)
         """
-        counts = np.maximum(light, 0, dtype=np.float32)
+        counts = np.maximum(real_array("light", light, 2), 0)
         if rng is not None:
-            rng = np.random.default_rng(rng)
+            rng = generator("rng", rng)
             if self.electrons_per_count is not None:
                 gain = self.electrons_per_count
                 counts = rng.poisson(counts * gain).astype(np.float32) / np.float32(gain)

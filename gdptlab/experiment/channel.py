@@ -1,7 +1,8 @@
 """The paper's experiment without its camera: a flow carries spheres while sound pushes them to the middle.
 
 Axes: x points downstream, y across the width w, z across the height h; y = z = 0 is the channel's centre,
-and the field of view is 0 ≤ x ≤ `view_length_um`. Lengths are in µm, times in s, speeds in µm/s.
+and the field of view is 0 ≤ x ≤ `view_length_um`: these are `x_channel_um`, `y_channel_um` and `z_um` of tables.
+Lengths are in µm, times in s, speeds in µm/s.
 
 All particles are alike. They move with the fluid along x, and across it at the radiation velocity of
 eqs (1a, 1b) of Rossi & Barnkob. As in the paper there is no streaming, no gravity (a 5 µm polystyrene
@@ -11,7 +12,6 @@ have closed forms, and only x needs a quadrature.
 
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from numbers import Integral
 from typing import Any, Self
 
 import numpy as np
@@ -19,11 +19,17 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PPoly
 
-from gdptlab._checks import choice, positive
+from gdptlab._checks import choice, generator, instance, numbers, positive
 
 TERMS = 100
 """Number of terms of the Poiseuille series. Chosen on the paper's channel: the error is 2e-6 of the peak speed on a
 wall and 3e-12 one particle radius off it; with 10 terms, 5e-4 and 6e-5. More terms only take time."""
+
+IN_CHANNEL = {"x": "x_channel_um", "y": "y_channel_um", "z": "z_um"}
+"""Columns of a position in the channel, by axis."""
+
+MOST_PARTICLES = 1e7
+"""Largest number of particles that are drawn. Chosen: their paths take some gigabytes; the paper's film has 100."""
 
 KNOTS = 10
 """Number of knots of the path integral in one focusing time. Chosen on 20 s in the paper's channel: the error is
@@ -37,19 +43,17 @@ def _positive_fields(obj: Any) -> None:
             object.__setattr__(obj, item.name, positive(item.name, getattr(obj, item.name)))
 
 
-def _instance(name: str, value: Any, kind: type) -> None:
-    """Refuse a value that is not of this class."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{name}: got {value!r}, allowed is a {kind.__name__}")
-
-
 def _within(name: str, value: ArrayLike, limit: float) -> NDArray[np.float64]:
     """Return `value` as an array of its shape if all of it, but for rounding, lies within ± `limit` µm."""
-    array = np.asarray(value, dtype=float)
-    outside = ~(np.abs(array) <= limit * (1 + 1e-12))  # in this form NaN is outside
-    if outside.any():
-        raise ValueError(f"{name}: got {array[outside].flat[0]}, allowed is -{limit:g} to {limit:g} µm")
-    return np.clip(array, -limit, limit)
+    return np.clip(numbers(name, value, -limit * (1 + 1e-12), limit * (1 + 1e-12)), -limit, limit)
+
+
+def _must_fit(name: str, array: NDArray, other: NDArray) -> None:
+    """Raise ValueError unless two arrays can be broadcast together."""
+    try:
+        np.broadcast_shapes(array.shape, other.shape)
+    except ValueError as error:
+        raise ValueError(f"{name}: got shape {array.shape}, allowed is one that fits {other.shape}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +90,7 @@ class Channel:
         """Speed on the centre line."""
         return float(self.velocity(0.0, 0.0))
 
-    def velocity(self, y_um: ArrayLike, z_um: ArrayLike) -> NDArray[np.float64]:
+    def velocity(self, y_channel_um: ArrayLike, z_um: ArrayLike) -> NDArray[np.float64]:
         """Return the Poiseuille velocity along x, in µm/s, at points in the channel (y and z broadcast together).
 
         This is the single Fourier series of the rectangular duct (Bruus, Theoretical Microfluidics, 2008,
@@ -99,8 +103,9 @@ class Channel:
         ValueError
             If a point is outside the channel.
         """
-        along = _within("y_um", y_um, self.width_um / 2)
+        along = _within("y_channel_um", y_channel_um, self.width_um / 2)
         across = _within("z_um", z_um, self.height_um / 2)
+        _must_fit("z_um", across, along)
         long, short = self.width_um, self.height_um
         if long < short:
             along, across, long, short = across, along, short, long
@@ -178,7 +183,7 @@ class Acoustics:
 
     def __post_init__(self) -> None:
         _positive_fields(self)
-        _instance("two_half_waves", self.two_half_waves, bool)
+        instance("two_half_waves", self.two_half_waves, bool)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +207,7 @@ class Focusing:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            _instance(item.name, getattr(self, item.name), item.type)
+            instance(item.name, getattr(self, item.name), item.type)
         side, radius = min(self.channel.width_um, self.channel.height_um), self.suspension.radius_um
         if 2 * radius >= side:
             raise ValueError(f"radius_um: got {radius:g}, allowed is below {side / 2:g}, half the channel")
@@ -245,8 +250,9 @@ class Focusing:
         Solves dy/dt = -U sin(2πy/w): tan(πy/w) = tan(πy_0/w) exp(-2πUt/w).
         """
         extent = self.extent_um(axis)
-        start = np.tan(np.pi / extent * _within("start_um", start_um, extent / 2))
-        return extent / np.pi * np.arctan(start * np.exp(-np.asarray(t_s) / self.focusing_time_s(axis)))
+        start, t = np.tan(np.pi / extent * _within("start_um", start_um, extent / 2)), numbers("t_s", t_s, 0)
+        _must_fit("t_s", t, start)
+        return extent / np.pi * np.arctan(start * np.exp(-t / self.focusing_time_s(axis)))
 
     def arrival_time(self, axis: str, start_um: ArrayLike) -> NDArray[np.float64]:
         """Return the time in s to reach the middle third from `start_um`: 0 inside it, inf from the wall itself."""
@@ -313,7 +319,7 @@ class Trajectories:
     ----------
     focusing : Focusing
     start : pandas.DataFrame
-        `particle, x_um, y_um, z_um` at t = 0, centres one radius or more off the walls. Copied.
+        `particle, x_channel_um, y_channel_um, z_um` at t = 0, centres one radius or more off the walls. Copied.
     duration_s : float
         Positions are known from 0 to this time (paper: 20).
     view_length_um : float
@@ -332,16 +338,16 @@ class Trajectories:
 
     def __post_init__(self) -> None:
         _positive_fields(self)
-        _instance("focusing", self.focusing, Focusing)
-        _instance("start", self.start, pd.DataFrame)
-        columns = ["particle", "x_um", "y_um", "z_um"]
+        instance("focusing", self.focusing, Focusing)
+        instance("start", self.start, pd.DataFrame)
+        columns = ["particle", *IN_CHANNEL.values()]
         if not set(columns) <= set(self.start.columns):
             raise ValueError(f"start: got columns {list(self.start.columns)}, allowed are {columns}")
         if self.start.empty:
             raise ValueError("start: got no particle, allowed is one or more")
-        _within("start x_um", self.start["x_um"], 1e9)
+        _within("start x_channel_um", self.start["x_channel_um"], 1e9)
         for axis in "yz":
-            _within(f"start {axis}_um", self.start[f"{axis}_um"], self.focusing.free_um(axis))
+            _within(f"start {IN_CHANNEL[axis]}", self.start[IN_CHANNEL[axis]], self.focusing.free_um(axis))
         object.__setattr__(self, "start", self.start[columns].reset_index(drop=True))
 
     @classmethod
@@ -380,26 +386,25 @@ class Trajectories:
         TypeError, ValueError
             If an argument is out of range, or `mean_in_view` so small that there would be no particle.
         """
-        _instance("focusing", focusing, Focusing)
-        if isinstance(rng, bool) or not isinstance(rng, Integral | np.random.Generator):
-            raise TypeError(f"rng: got {rng!r}, allowed is an integer seed or a numpy Generator")
-        if isinstance(rng, Integral) and rng < 0:
-            raise ValueError(f"rng: got {rng!r}, allowed is a seed of at least 0")
+        instance("focusing", focusing, Focusing)
+        rng = generator("rng", rng)
         border, view = positive("border_um", border_um, zero=True), positive("view_length_um", view_length_um)
         density = positive("mean_in_view", mean_in_view) / view
         drift = focusing.channel.max_speed_um_s * positive("duration_s", duration_s)
+        if not density * (view + 2 * border + drift) < MOST_PARTICLES:
+            raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed are {MOST_PARTICLES:g} particles in all")
         # Stretches from the downstream end: the view with its borders, then as many views as the drift needs.
         ends = view + 2 * border + view * np.arange(1 + np.ceil(drift / view))
         starts, counts = np.concatenate([[0.0], ends[:-1]]), np.diff(np.rint(density * ends), prepend=0).astype(int)
-        generator, half = np.random.default_rng(rng), [focusing.free_um("y"), focusing.free_um("z")]
+        half = [focusing.free_um("y"), focusing.free_um("z")]
         xyz = np.concatenate(
             [
-                generator.uniform([view + border - b, -half[0], -half[1]], [view + border - a, *half], size=(n, 3))
+                rng.uniform([view + border - b, -half[0], -half[1]], [view + border - a, *half], size=(n, 3))
                 for a, b, n in zip(starts, ends, counts, strict=True)
             ]
         )
-        start = pd.DataFrame(xyz, columns=["x_um", "y_um", "z_um"]).assign(particle=np.arange(len(xyz)))
-        start = start[start["x_um"] >= -border - drift]
+        start = pd.DataFrame(xyz, columns=list(IN_CHANNEL.values())).assign(particle=np.arange(len(xyz)))
+        start = start[start["x_channel_um"] >= -border - drift]
         if start.empty:
             least = view / ends[0]
             raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed is {least:.2g} or more, one particle in all")
@@ -422,7 +427,7 @@ class Trajectories:
 
     def _across(self, t_s: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Return y and z at these times (k,), each of shape (k, particles)."""
-        return [self.focusing.path(axis, self.start[f"{axis}_um"], t_s[:, None]) for axis in "yz"]
+        return [self.focusing.path(axis, self.start[IN_CHANNEL[axis]], t_s[:, None]) for axis in "yz"]
 
     def table(self, times_s: ArrayLike, *, border_um: float = 0.0) -> pd.DataFrame:
         """Return positions at many times.
@@ -438,23 +443,23 @@ class Trajectories:
         Returns
         -------
         pandas.DataFrame
-            `frame` (index into `times_s`), `particle, t_s, x_um, y_um, z_um`, sorted by frame.
+            `frame` (index into `times_s`), `particle, t_s, x_channel_um, y_channel_um, z_um`, sorted by frame.
 
         Raises
         ------
         ValueError
             If a time or the border is out of range.
         """
-        t = np.asarray(times_s, dtype=float)
-        if t.ndim != 1 or not np.all((t >= 0) & (t <= self.duration_s)):
-            raise ValueError(f"times_s: got {times_s!r}, allowed are one axis, 0 to {self.duration_s:g} s")
+        t = numbers("times_s", times_s, 0, self.duration_s)
+        if t.ndim != 1:
+            raise ValueError(f"times_s: got shape {t.shape}, allowed is one axis")
         border = border_um if border_um == np.inf else positive("border_um", border_um, zero=True)
-        x = self.start["x_um"].to_numpy() + self._drift(t)
+        x = self.start["x_channel_um"].to_numpy() + self._drift(t)
         y, z = self._across(t)
         frame, row = np.nonzero((x >= -border) & (x <= self.view_length_um + border))
         columns = {"frame": frame, "particle": self.start["particle"].to_numpy()[row], "t_s": t[frame]}
-        xyz = {"x_um": x[frame, row], "y_um": y[frame, row], "z_um": z[frame, row]}
-        return pd.DataFrame(columns | xyz)
+        xyz = (x[frame, row], y[frame, row], z[frame, row])
+        return pd.DataFrame(columns | dict(zip(IN_CHANNEL.values(), xyz, strict=True)))
 
     def positions(self, t_s: float, *, border_um: float = 0.0) -> pd.DataFrame:
         """Return positions at one time, in about 1 ms: the columns of `table` but for `frame`."""
@@ -462,4 +467,4 @@ class Trajectories:
 
     def trigger_time(self, axis: str, fraction: float = 0.9) -> float:
         """Return the exact trigger time in s of all particles, in view or not: see `Focusing.trigger_time`."""
-        return self.focusing.trigger_time(axis, fraction, start_um=self.start[f"{axis}_um"])
+        return self.focusing.trigger_time(axis, fraction, start_um=self.start[IN_CHANNEL[axis]])

@@ -5,8 +5,8 @@ Too much for a notebook that is run each time, so `python -m gdptlab sweep` comp
 it was.
 
 Four tables of what a monitor sees (`PARTS`) go into one file, a row for each film, setting and evaluated frame, with
-the columns of `replay.sweep` and `valid`, the number of measured particles that match a true one (`assessment.match`).
-The times of evaluation go into a second file, and a card into a third.
+the columns of `replay.sweep` and `valid`, the number of measured particles that match a true one
+(`assessment.count_valid`). The times of evaluation go into a second file, and a card into a third.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from tqdm.auto import tqdm
 from gdptlab._checks import whole
 from gdptlab._files import written_whole
 from gdptlab._versions import versions
-from gdptlab.assessment import match
+from gdptlab.assessment import count_valid
 from gdptlab.calibration import Calibration
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.image_types import IMAGE_TYPES
@@ -70,9 +70,6 @@ EVALUATORS = {
 
 REPEATS = 3
 """Runs of each timed evaluation, of which the least counts."""
-
-FAR_PX = 1e5
-"""Distance in x, px, by which the frames of a film are set apart to be matched at once; any above a frame's width."""
 
 
 @dataclass(frozen=True)
@@ -128,20 +125,9 @@ def monitor(part: Part, seed: int) -> pd.DataFrame:
         table = sweep([one], ways, every=part.every, level=LEVEL, progress=False)
         found = evaluate(one, ways, every=part.every, progress=False)  # from the cache
         frames, true = evaluated_frames(one, part.every), one.truth()
-        valid = [valid_particles(measured, true, frames) for measured in found]
+        valid = [count_valid(measured, true, frames) for measured in found]
         tables.append(table.assign(valid=np.concatenate(valid)))
     return pd.concat(tables, ignore_index=True)
-
-
-def valid_particles(measured: pd.DataFrame, true: pd.DataFrame, frames: Sequence[int]) -> np.ndarray:
-    """Number of measured particles that match a true one, within 2 px and 10 µm, in each of the `frames`."""
-    true = true[true["frame"].isin(frames)]
-    # All frames at once, each far from the others: `match` frame by frame takes longer than the evaluation.
-    measured, true_too = (
-        t.assign(x_px=t["x_px"] + FAR_PX * t["frame"]).drop(columns="frame") for t in (measured, true)
-    )
-    pairs = match(measured, true_too)
-    return np.bincount(np.searchsorted(frames, true["frame"].loc[pairs["true"]]), minlength=len(frames))
 
 
 def times(count: int) -> pd.DataFrame:

@@ -12,7 +12,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab._checks import choice, positive, whole
+from gdptlab._checks import choice, instance, pair, positive, whole
+from gdptlab._checks import table as check_table
 from gdptlab.experiment.camera import Camera
 from gdptlab.experiment.channel import Focusing, Trajectories
 from gdptlab.experiment.image_types import IMAGE_TYPES
@@ -63,12 +64,13 @@ class Film:
 
     def __post_init__(self) -> None:
         for name, kind in {"trajectories": Trajectories, "microscope": Microscope, "camera": Camera}.items():
-            if not isinstance(getattr(self, name), kind):
-                raise TypeError(f"{name}: got {getattr(self, name)!r}, allowed is a {kind.__name__}")
+            instance(name, getattr(self, name), kind)
         choice("image_type", self.image_type, IMAGE_TYPES)
         whole("seed", self.seed, 0, 2**63)
         object.__setattr__(self, "frame_rate_hz", positive("frame_rate_hz", self.frame_rate_hz))
-        object.__setattr__(self, "shape", _checked_shape(self.shape))
+        object.__setattr__(self, "shape", pair("shape", self.shape))
+        if not self.trajectories.duration_s * self.frame_rate_hz < 2**31:
+            raise ValueError(f"frame_rate_hz: got {self.frame_rate_hz:g}, allowed are 2**31 frames in all")
         if len(self) == 0:
             least = 1 / self.trajectories.duration_s
             raise ValueError(f"frame_rate_hz: got {self.frame_rate_hz:g}, allowed is {least:g} or more: one frame")
@@ -120,8 +122,8 @@ class Film:
         TypeError, ValueError
             If an argument is out of range.
         """
-        microscope = Microscope() if microscope is None else microscope
-        shape = _checked_shape(shape)
+        microscope = Microscope() if microscope is None else instance("microscope", microscope, Microscope)
+        shape = pair("shape", shape)
         trajectories = Trajectories.seeded(
             Focusing() if focusing is None else focusing,
             whole("seed", seed, 0, 2**63),
@@ -184,25 +186,24 @@ class Film:
         Returns
         -------
         DataFrame
-            Copy with `x_um`, downstream from the frame's left edge, and `y_um`, from the channel's middle; of
-            `x_std_px` and `y_std_px`, if there, `x_std_um` and `y_std_um`.
+            Copy with `x_channel_um`, downstream from the frame's left edge, and `y_channel_um`, from the channel's
+            middle; of `x_std_px` and `y_std_px`, if there, `x_std_um` and `y_std_um`.
 
         Raises
         ------
         ValueError
             If a column is missing.
         """
-        if not {"x_px", "y_px"} <= set(table):
-            raise ValueError(f"table: got columns {list(table)}, needed are x_px and y_px")
+        check_table("table", table, ["x_px", "y_px"])
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2
         stds = {f"{a}_std_um": table[f"{a}_std_px"] * scale for a in "xy" if f"{a}_std_px" in table}
         x_px, y_px = table["x_px"].to_numpy(), table["y_px"].to_numpy()
-        return table.assign(x_um=(x_px + 0.5) * scale, y_um=(y_px - middle) * scale, **stds)
+        return table.assign(x_channel_um=(x_px + 0.5) * scale, y_channel_um=(y_px - middle) * scale, **stds)
 
     def _to_pixels(self, table: pd.DataFrame) -> pd.DataFrame:
         """Add `x_px`, `y_px` to a table in the channel's coordinates."""
         scale, middle = self.microscope.um_per_px, (self.shape[0] - 1) / 2
-        return table.assign(x_px=table["x_um"] / scale - 0.5, y_px=table["y_um"] / scale + middle)
+        return table.assign(x_px=table["x_channel_um"] / scale - 0.5, y_px=table["y_channel_um"] / scale + middle)
 
     def stack(self, n: int = 51, size: int = 61, seed: int = 0) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
         """Return a calibration stack in this film's image type, from the channel's floor to its ceiling.
@@ -236,10 +237,3 @@ class Film:
         z_um = np.linspace(-half, half, n)
         noise = np.random.default_rng(np.random.SeedSequence(whole("seed", seed, 0, 2**63), spawn_key=(1,)))
         return self.microscope.stack(z_um, size, image_type=self.image_type, camera=self.camera, rng=noise), z_um
-
-
-def _checked_shape(shape: tuple[int, int]) -> tuple[int, int]:
-    """Return `shape` if it is a pair (rows, columns) of whole numbers."""
-    if not isinstance(shape, tuple) or len(shape) != 2:
-        raise TypeError(f"shape: got {shape!r}, allowed is a pair (rows, columns)")
-    return whole("shape[0]", shape[0], 1, 2**20), whole("shape[1]", shape[1], 1, 2**20)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from gdptlab._checks import choice, positive
+from gdptlab._checks import choice, number, numbers, positive, real_array
 
 WHITE = 20_000.0
 """Counts of the empty field in a brightfield image. The paper gives none. Chosen: twice the peak of the brightest
@@ -70,7 +70,8 @@ def brightfield(light: NDArray, white: float = WHITE) -> NDArray:
     -------
     array (rows, columns)
     """
-    return white - light
+    real_array("light", light, 2)
+    return number("white", white) - np.asarray(light)
 
 
 def disturbed(
@@ -99,10 +100,15 @@ def disturbed(
     -------
     array (rows, columns)
     """
-    rows, columns = light.shape
-    along_x = np.sin(2 * np.pi * np.arange(columns) / positive("period_px[0]", period_px[0]) + phase_rad[0])
-    along_y = np.sin(2 * np.pi * np.arange(rows) / positive("period_px[1]", period_px[1]) + phase_rad[1])
-    return brightfield(light, white) + amplitude * np.outer(along_y, along_x).astype(np.result_type(light, np.float32))
+    rows, columns = real_array("light", light, 2).shape
+    phases = numbers("phase_rad", phase_rad)
+    for name, two in (("period_px", period_px), ("phase_rad", phase_rad)):
+        if np.shape(two) != (2,):
+            raise ValueError(f"{name}: got {two!r}, allowed are two numbers, along x and y")
+    along_x = np.sin(2 * np.pi * np.arange(columns) / positive("period_px[0]", period_px[0]) + phases[0])
+    along_y = np.sin(2 * np.pi * np.arange(rows) / positive("period_px[1]", period_px[1]) + phases[1])
+    wave = np.outer(along_y, along_x).astype(np.result_type(light, np.float32))
+    return brightfield(light, white) + number("amplitude", amplitude) * wave
 
 
 IMAGE_TYPES: dict[str, Callable[[NDArray], NDArray]] = {

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_lsq_spline
 from scipy.stats import qmc
 
-from gdptlab._checks import number, positive, whole
+from gdptlab._checks import LARGEST, generator, instance, number, pair, positive, real_array, whole
+from gdptlab._checks import table as check_table
 from gdptlab._compiled import on_one_core
 from gdptlab._files import cache_folder, keep_arrays, kept_arrays
 from gdptlab.experiment.camera import Camera
@@ -249,7 +250,8 @@ class Microscope:
             If a column is missing, a number is not finite, or a depth is outside the measured volume
             (with 5 µm to spare).
         """
-        return (camera or Camera()).record(as_image_type(image_type)(self.light(particles, shape)), rng)
+        camera = Camera() if camera is None else instance("camera", camera, Camera)
+        return camera.record(as_image_type(image_type)(self.light(particles, shape)), rng)
 
     @on_one_core
     def light(self, particles: pd.DataFrame, shape: tuple[int, int] = (512, 512)) -> NDArray[np.float32]:
@@ -259,7 +261,7 @@ class Microscope:
         (`DIAMETER_RATIO` apart, the microscope's own among them) on a fine grid of depths and sub-pixel offsets
         (`Library`), and placed by linear interpolation. Their light grows with the square of the diameter.
         """
-        shape = tuple(whole(f"shape[{i}]", n, 1, 2**20) for i, n in enumerate(shape))
+        shape = pair("shape", shape)
         positions, amplitude, relative = self._checked(particles)
         node = np.log(relative) / np.log(DIAMETER_RATIO)
         node = np.where(np.abs(node - np.rint(node)) < 1e-9, np.rint(node), node)
@@ -276,17 +278,15 @@ class Microscope:
 
     def _checked(self, particles: pd.DataFrame) -> tuple[NDArray, NDArray, NDArray]:
         """Return positions (n, 3), amplitudes (n,) and diameters over the microscope's (n,), or refuse them."""
-        missing = {"x_px", "y_px", "z_um"} - set(particles)
-        if missing:
-            raise ValueError(f"particles: got no column {sorted(missing)}, needed are x_px, y_px and z_um")
+        check_table("particles", particles, ["x_px", "y_px", "z_um"])
         positions = particles[["x_px", "y_px", "z_um"]].to_numpy(dtype=float)
         defaults = {"amplitude": 1.0, "diameter_um": self.diameter_um}
         sizes = [
             particles[name].to_numpy(dtype=float) if name in particles else np.full(len(positions), value)
             for name, value in defaults.items()
         ]
-        if not all(np.isfinite(values).all() for values in (positions, *sizes)):
-            raise ValueError("particles: got NaN or infinity, allowed are finite numbers")
+        if not all((np.abs(values) <= LARGEST).all() for values in (positions, *sizes)):
+            raise ValueError(f"particles: got numbers that are NaN or beyond {LARGEST:g}, allowed are numbers to there")
         if not all((values > 0).all() for values in sizes):
             raise ValueError("particles: got an amplitude or diameter_um of 0 or below, allowed is above 0")
         deepest, z_um = self.depth_um / 2 + MARGIN_UM, positions[:, 2]
@@ -320,7 +320,7 @@ class Microscope:
         """
         if whole("size", size, 1, 2**20) % 2 == 0:
             raise ValueError(f"size: got {size}, allowed are odd numbers")
-        rng = None if rng is None else np.random.default_rng(rng)
+        rng, z_um = None if rng is None else generator("rng", rng), real_array("z_um", z_um, 1)
         middle = (size - 1) / 2
         return np.stack(
             [

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
+from numbers import Integral
 from typing import Any
 
 import joblib
@@ -25,9 +26,11 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from gdptlab._checks import positive, whole
+from gdptlab._checks import flag, function, instance, instances, numbers, positive, processes, whole
+from gdptlab._checks import table as check_table
 from gdptlab._files import keep_arrays, kept_arrays, sources_folder
 from gdptlab._versions import versions
+from gdptlab._workers import leave_with_parent
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
 
@@ -58,8 +61,9 @@ class Method:
     label: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not callable(self.evaluator):
-            raise TypeError(f"evaluator: got {self.evaluator!r}, allowed is a function like locate")
+        function("evaluator", self.evaluator)
+        for name in ("settings", "label"):
+            instance(name, getattr(self, name), Mapping)
 
     def __call__(self, image: NDArray) -> pd.DataFrame:
         """Evaluate one frame.
@@ -109,7 +113,11 @@ def grid(
     list of Method
         With labels `n`, `n_sub`, `refine`.
     """
-    refine = list(refine)
+    function("calibrate", calibrate)
+    n, n_sub, refine = (
+        instances(name, value, kind)
+        for name, value, kind in (("n", n, Integral), ("n_sub", n_sub, Integral), ("refine", refine, bool))
+    )
     pairs = [(a, b) for a in n for b in n_sub if b <= a]
     calibrations = {pair: calibrate(n=pair[0], n_sub=pair[1]) for pair in pairs}
     return [
@@ -160,13 +168,11 @@ def evaluate(
         If an argument is not of its form, an evaluator returns no such table, or, with `cache`, a part of a
         method cannot be told from another by its value.
     """
-    if n_jobs != -1:
-        whole("n_jobs", n_jobs, 1, 10_000)
-    for method in methods:
-        if not isinstance(method, Method):
-            raise TypeError(f"methods: got {method!r} in it, allowed are Methods")
+    n_jobs = processes("n_jobs", n_jobs)
+    methods = instances("methods", methods, Method)
     frames = evaluated_frames(film, every)
-    folder = sources_folder("replay") if cache else None
+    flag("progress", progress)
+    folder = sources_folder("replay") if flag("cache", cache) else None
     paths = [folder / _cache_name(film, method, frames) if folder else None for method in methods]
     # `joblib.Memory` would keep the result of one call; here one pass over the film serves all missing tables.
     tables = [kept_arrays(path) if path else None for path in paths]
@@ -177,7 +183,8 @@ def evaluate(
     # This process evaluates the first frame, so that workers get calibrations whose lazy parts are there already.
     parts = [_evaluated(film, todo, frames[:1])]
     blocks = [frames[k : k + FRAMES_PER_JOB] for k in range(1, len(frames), FRAMES_PER_JOB)]
-    jobs = Parallel(n_jobs=n_jobs, return_as="generator")(delayed(_evaluated)(film, todo, block) for block in blocks)
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator", initializer=leave_with_parent)
+    jobs = parallel(delayed(_evaluated)(film, todo, block) for block in blocks)
     with tqdm(total=len(frames), initial=1, desc="frames", unit="frame", leave=False, disable=not progress) as bar:
         for block, part in zip(blocks, jobs, strict=True):
             parts.append(part)
@@ -191,7 +198,7 @@ def evaluate(
 
 def evaluated_frames(film: Film, every: int = 1) -> NDArray[np.int64]:
     """Return the numbers of the frames that `evaluate` looks at, (n,)."""
-    return np.arange(0, len(film), whole("every", every, 1, len(film)))
+    return np.arange(0, len(instance("film", film, Film)), whole("every", every, 1, len(film)))
 
 
 def _evaluated(film: Film, methods: Sequence[Method], frames: NDArray[np.int64]) -> list[dict[str, NDArray]]:
@@ -262,11 +269,12 @@ def durations(film: Film, methods: Sequence[Method], *, count: int = 20, progres
     DataFrame
         The methods' labels, `frame`, and `tau_s`, the wall time.
     """
-    frames = np.unique(np.linspace(0, len(film) - 1, whole("count", count, 1, 10_000)).astype(int)).tolist()
+    methods, last = instances("methods", methods, Method), len(instance("film", film, Film)) - 1
+    frames = np.unique(np.linspace(0, last, whole("count", count, 1, 10_000)).astype(int)).tolist()
     for method in methods:
         method(film[frames[0]])
     rows = []
-    for frame in tqdm(frames, desc="timed", unit="frame", leave=False, disable=not progress):
+    for frame in tqdm(frames, desc="timed", unit="frame", leave=False, disable=not flag("progress", progress)):
         image = film[frame]
         for method in methods:
             start = time.perf_counter()
@@ -310,14 +318,14 @@ def sweep(
         * `level`; `true_h_s`, `true_w_s`: first of *all* frames of the film, evaluated or not, at which the
           true fraction reaches it (NaN: never).
     """
-    films = list(films)
+    films, methods = instances("films", films, Film), instances("methods", methods, Method)
     names = [(film.seed, film.image_type) for film in films]
     if len(set(names)) < len(names):
         raise ValueError(f"films: got {names}, allowed are films that differ in seed or image_type")
     if not films or not methods:
         raise ValueError(f"films, methods: got {len(films)} and {len(methods)}, allowed are one or more")
     parts = []
-    for film in tqdm(films, desc="films", unit="film", disable=not progress):
+    for film in tqdm(films, desc="films", unit="film", disable=not flag("progress", progress)):
         channel, frames = film.trajectories.focusing.channel, evaluated_frames(film, every)
         truth = fractions(film.to_channel(film.truth()), np.arange(len(film)), channel).drop(columns="frame")
         triggers = {f"true_{a}_s": trigger_time(film.times_s, truth[f"fraction_{a}"], level) for a in "hw"}
@@ -358,13 +366,13 @@ def watch(times_s: ArrayLike, tau_s: ArrayLike, phase_s: float = 0.0) -> pd.Data
     TypeError, ValueError
         If τ is not above 0, the phase negative, or the times do not increase.
     """
-    times = np.asarray(times_s, dtype=float)
+    times = numbers("times_s", times_s)
     if times.ndim != 1 or not len(times) or not (np.diff(times) > 0).all():
         raise ValueError(f"times_s: got {times_s!r}, allowed are one or more increasing times")
     if np.ndim(tau_s) == 0:
         tau = np.full(len(times), positive("tau_s", tau_s))
     else:
-        tau = np.asarray(tau_s, dtype=float)
+        tau = numbers("tau_s", tau_s)
         if tau.shape != times.shape or not (np.isfinite(tau) & (tau > 0)).all():
             raise ValueError(
                 f"tau_s: got {tau_s!r}, allowed is a number above 0, or one for each of {len(times)} frames"
@@ -409,7 +417,7 @@ def expected_delay(tau_s: ArrayLike, camera_s: float = 0.04, truth_s: float | No
     DataFrame
         `tau_s`; `mean_s`, `low_s` and `high_s`: mean, smallest and largest delay of the frame's timestamp.
     """
-    tau = np.atleast_1d(np.asarray(tau_s, dtype=float))
+    tau = np.atleast_1d(numbers("tau_s", tau_s))
     for value in tau.tolist():
         positive("tau_s", value)
     d = positive("camera_s", camera_s)
@@ -460,6 +468,8 @@ def errors(
     """
     whole("phases", phases, 1, 10_000)
     positive("limit_s", limit_s)
+    columns = ["frame", "t_s", "fraction_h", "fraction_w", "true_fraction_h", "true_fraction_w", "level"]
+    check_table("table", table, [*columns, "true_h_s", "true_w_s"])
     if tau_s is None and "tau_s" not in table:
         raise ValueError("tau_s: got None, allowed is a number above 0 where the table has no column tau_s")
     keys = [name for name in table.columns[: table.columns.get_loc("frame")] if name != "tau_s"]
@@ -493,6 +503,8 @@ def _clock(times: NDArray, tau: float | NDArray, fraction: float) -> tuple:
     mean = float(np.mean(tau))
     phase = fraction * (max(mean, times[1] - times[0]) if len(times) > 1 else mean)
     used = watch(times, tau, phase)
+    if used.empty:
+        raise ValueError(f"tau_s: got {mean:g}, allowed is no more than the film lasts")
     lists = (used["t_s"].tolist(), used["decision_s"].tolist(), used["dropped"].cumsum().tolist())
     return mean, phase, used["index"].to_numpy(), *lists
 
@@ -514,8 +526,11 @@ def summary(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
         ones beyond the limit); `impossible`, not among them: the film ends too early. For `error_s` and
         `own_error_s` of all possible ones that fired: `..._median`, `..._q25`, `..._q75` (NaN where none did).
     """
-    rows = []
-    for key, part in table.groupby(list(by), sort=False):
+    by, rows = instances("by", by, str), []
+    check_table("table", table, ["possible", "fired", "failed", "error_s", "own_error_s"])
+    if not by or set(by) - set(table):
+        raise ValueError(f"by: got {by}, allowed are one or more columns of the table, {', '.join(table)}")
+    for key, part in table.groupby(by, sort=False):
         possible = part[part["possible"]]
         fired = possible[possible["fired"]]
         row = dict(zip(by, key, strict=True)) | {

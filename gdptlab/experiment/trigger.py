@@ -4,7 +4,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import positive
+from gdptlab._checks import choice, instance, numbers, positive
+from gdptlab._checks import table as check_table
 from gdptlab.experiment.channel import Channel
 
 
@@ -14,7 +15,7 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
     Parameters
     ----------
     table : DataFrame
-        Particles, measured or true, in channel coordinates: `frame`, `y_um`, `z_um` (see `Film.to_channel`).
+        Particles, measured or true, in channel coordinates: `frame`, `y_channel_um`, `z_um` (see `Film.to_channel`).
     frames : array (n,)
         Frames to report, increasing, with or without particles; others are ignored.
     channel : Channel
@@ -30,9 +31,8 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
     ValueError
         If a column is missing or the frames do not increase.
     """
-    missing = {"frame", "y_um", "z_um"} - set(table)
-    if missing:
-        raise ValueError(f"table: got no column {sorted(missing)}, needed are frame, y_um and z_um")
+    check_table("table", table, ["frame", "y_channel_um", "z_um"])
+    numbers("frames", frames)
     frames = np.asarray(frames)
     if frames.ndim != 1 or (np.diff(frames) <= 0).any():
         raise ValueError(f"frames: got {frames}, allowed are increasing numbers")
@@ -50,7 +50,10 @@ def fractions(table: pd.DataFrame, frames: ArrayLike, channel: Channel) -> pd.Da
 
 def in_middle_third(table: pd.DataFrame, of: str, channel: Channel) -> NDArray[np.bool_]:
     """Tell which particles (n,) of a table in channel coordinates have |z| ≤ h/6 (of 'h') or |y| ≤ w/6 (of 'w')."""
-    column, size_um = {"h": ("z_um", channel.height_um), "w": ("y_um", channel.width_um)}[of]
+    instance("channel", channel, Channel)
+    sides = {"h": ("z_um", channel.height_um), "w": ("y_channel_um", channel.width_um)}
+    column, size_um = sides[choice("of", of, sides)]
+    check_table("table", table, [column])
     return np.abs(table[column].to_numpy()) <= size_um / 6
 
 
@@ -64,8 +67,11 @@ def trigger_time(times_s: ArrayLike, fraction: ArrayLike, level: float = 0.9) ->
     level : float
         Fraction that triggers, in (0, 1] (paper: 0.9).
     """
-    hits = np.flatnonzero(np.asarray(fraction) >= _level(level))
-    return float(np.asarray(times_s)[hits[0]]) if len(hits) else np.nan
+    times, fraction = numbers("times_s", times_s), np.asarray(fraction)
+    if fraction.dtype.kind not in "buif" or fraction.shape != times.shape or times.ndim != 1:
+        raise ValueError(f"fraction: got {fraction!r}, allowed is a number for each of the times")
+    hits = np.flatnonzero(fraction >= _level(level))
+    return float(times[hits[0]]) if len(hits) else np.nan
 
 
 def _level(level: float) -> float:

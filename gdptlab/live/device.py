@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, positive, whole
+from gdptlab._checks import choice, instance, instances, numbers, positive, whole
 from gdptlab.experiment.channel import Trajectories
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
@@ -56,24 +56,22 @@ class Switched(Trajectories):
         """Positions at many times, as `Trajectories.table`."""
         if self.off_s is None:
             return super().table(times_s, border_um=border_um)
-        t = np.asarray(times_s, dtype=float)
-        if not np.all((t >= 0) & (t <= self.duration_s)):
-            raise ValueError(f"times_s: got {times_s!r}, allowed are 0 to {self.duration_s:g} s")
+        t = numbers("times_s", times_s, 0, self.duration_s)
         if border_um != np.inf:
             positive("border_um", border_um, zero=True)
         on_s = np.minimum(t, self.off_s)
         table = super().table(on_s, border_um=np.inf)
         drifting = (t - on_s)[table["frame"]]
-        speed = self.focusing.channel.velocity(table["y_um"], table["z_um"])
-        table["x_um"] += speed * drifting
+        speed = self.focusing.channel.velocity(table["y_channel_um"], table["z_um"])
+        table["x_channel_um"] += speed * drifting
         table["t_s"] = t[table["frame"]]
-        seen = table["x_um"].between(-border_um, self.view_length_um + border_um)
+        seen = table["x_channel_um"].between(-border_um, self.view_length_um + border_um)
         return table[seen].reset_index(drop=True)
 
 
 def switched(film: Film, off_s: float | None) -> Film:
     """Return the film that would have been taken if the sound had been switched off at `off_s`."""
-    old = film.trajectories
+    old = instance("film", film, Film).trajectories
     fields = {name: getattr(old, name) for name in ("focusing", "start", "duration_s", "view_length_um")}
     return replace(film, trajectories=Switched(**fields, off_s=off_s))
 
@@ -149,8 +147,7 @@ class Device:
         RuntimeError
             If the process is gone.
         """
-        if not isinstance(film, Film):
-            raise TypeError(f"film: got a {type(film).__name__}, allowed is a Film")
+        instance("film", film, Film)
         whole("ahead", ahead, 0, len(film))
         if film.shape != self.shape:
             raise ValueError(f"film: got frames of {film.shape}, allowed are {self.shape}")
@@ -284,6 +281,7 @@ def true_fractions(film: Film, times_s: ArrayLike) -> pd.DataFrame:
     DataFrame
         `t_s`, `count`, `fraction_h`, `fraction_w`, as in `experiment.fractions`.
     """
+    film = instance("film", film, Film)
     table = fractions(film.trajectories.table(times_s), np.arange(len(times_s)), film.trajectories.focusing.channel)
     return table.drop(columns="frame").assign(t_s=times_s)
 
@@ -378,8 +376,11 @@ def timed(films: Iterable[Film], timers_s: ArrayLike, of: str = "w") -> pd.DataF
     """
     choice("of", of, "hw")
     parts = []
-    for film in films:
+    for film in instances("films", films, Film):
+        numbers("timers_s", timers_s, 0, film.trajectories.duration_s)
         energy = film.trajectories.focusing.acoustics.energy_density_J_m3
         table = true_fractions(film, timers_s).rename(columns={"t_s": "off_s", f"fraction_{of}": "true_fraction"})
         parts.append(table[["off_s", "true_fraction"]].assign(seed=film.seed, energy_density_J_m3=energy))
+    if not parts:
+        raise ValueError("films: got none, allowed are one or more")
     return pd.concat(parts, ignore_index=True)

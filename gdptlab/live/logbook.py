@@ -17,7 +17,6 @@ import os
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 from threading import Condition, Thread
 from typing import Any
 from uuid import uuid4
@@ -25,6 +24,7 @@ from uuid import uuid4
 import numpy as np
 import pandas as pd
 
+from gdptlab._checks import path as check_path
 from gdptlab._checks import whole
 
 RETRY_S = 0.5
@@ -63,7 +63,7 @@ class Logbook:
 
     def __init__(self, path: str | os.PathLike[str], *, most: int = 10_000) -> None:
         self.run, self.written, self.lost, self.problem, self._appended = uuid4().hex[:12], 0, 0, "", 0
-        self._most, self._path = whole("most", most, 1, 2**31), Path(path)
+        self._most, self._path = whole("most", most, 1, 2**31), check_path("path", path)
         self._lines: deque[bytes] = deque()
         self._changed, self._closing = Condition(), False
         self._open()
@@ -184,7 +184,10 @@ def read_log(path: str | os.PathLike[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
         If there is no such file.
     """
     runs, rows, tables = {}, [], []
-    with open(path, encoding="utf-8", errors="replace") as file:
+    path = check_path("path", path)
+    if not path.is_file():
+        raise FileNotFoundError(f"path: got {str(path)!r}, allowed is a file")
+    with path.open(encoding="utf-8", errors="replace") as file:
         for text in file:
             try:
                 line = json.loads(text)
@@ -195,7 +198,7 @@ def read_log(path: str | os.PathLike[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
                 continue
             particles = line.pop("particles", None)
             for name in ("fraction", "on"):
-                line |= {f"{name}_{trigger}": value for trigger, value in line.pop(name).items()}
+                line |= {f"{name}_{trigger}": value for trigger, value in line.pop(name, {}).items()}
             rows.append({"run": run} | line)
             if particles:
                 tables.append(pd.DataFrame(particles).assign(run=run, frame=line["frame"]))

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from threading import Condition, Event, Lock, Thread, current_thread
+from threading import TIMEOUT_MAX, Condition, Event, Lock, Thread, current_thread
 from time import perf_counter, sleep
 from typing import Any, Self
 
@@ -27,7 +27,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, number, positive, real_array, whole
+from gdptlab._checks import choice, function, instance, instances, iterable, number, positive, real_array, whole
+from gdptlab._checks import path as check_path
 from gdptlab.experiment.channel import Channel
 from gdptlab.experiment.trigger import in_middle_third
 from gdptlab.live.logbook import Logbook
@@ -82,7 +83,10 @@ def at_speed(frames: Iterable[ArrayLike], rate_hz: float) -> Iterator[ArrayLike]
     TypeError, ValueError
         If the rate is not a number above 0.
     """
+    iterable("frames", frames)
     period_s = 1 / positive("rate_hz", rate_hz)
+    if period_s > TIMEOUT_MAX:
+        raise ValueError(f"rate_hz: got {rate_hz}, allowed is {1 / TIMEOUT_MAX:.0e} or more")
 
     def paced() -> Iterator[ArrayLike]:
         """Sleep until the time of each frame (the check of the rate must not wait for the first)."""
@@ -104,8 +108,7 @@ class MiddleThird:
         'h' (|z| ≤ h/6) or 'w' (|y| ≤ w/6), as in `experiment.fractions`.
     channel : Channel
     to_channel : callable
-        Table of an evaluator -> the same with `y_um` and `z_um`, measured from the channel's middle; for example
-        `Film.to_channel`.
+        Table of an evaluator -> the same with `y_channel_um` and `z_um`; for example `Film.to_channel`.
 
     Raises
     ------
@@ -119,9 +122,8 @@ class MiddleThird:
 
     def __post_init__(self) -> None:
         choice("of", self.of, "hw")
-        if not isinstance(self.channel, Channel):
-            raise TypeError(f"channel: got {self.channel!r}, allowed is a Channel")
-        _function("to_channel", self.to_channel)
+        instance("channel", self.channel, Channel)
+        function("to_channel", self.to_channel)
 
     def __call__(self, table: pd.DataFrame) -> float:
         """Return the fraction, from 0 to 1; NaN without particles."""
@@ -142,7 +144,7 @@ def middle_thirds(channel: Channel, to_channel: Callable[[pd.DataFrame], pd.Data
     TypeError
         If one is not of its kind.
     """
-    _function("to_channel", to_channel)
+    function("to_channel", to_channel)
     last: tuple[pd.DataFrame | None, pd.DataFrame | None] = (None, None)
 
     def converted(table: pd.DataFrame) -> pd.DataFrame:
@@ -197,7 +199,7 @@ class Trigger:
             raise TypeError(f"name: got {self.name!r}, allowed is a word")
         for part in ("fraction", "action", "released"):
             if part != "released" or self.released is not None:
-                _function(part, getattr(self, part))
+                function(part, getattr(self, part))
         positive("level", self.level)
         if positive("release", self.release, zero=True) > self.level:
             raise ValueError(f"release: got {self.release:g}, allowed is up to level, {self.level:g}")
@@ -208,12 +210,6 @@ class Trigger:
         if count < self.least:
             return on
         return bool(fraction >= (self.release if on else self.level) or (on and np.isnan(fraction)))
-
-
-def _function(name: str, value: Any) -> None:
-    """Refuse a value that cannot be called."""
-    if not callable(value):
-        raise TypeError(f"{name}: got {value!r}, allowed is a function")
 
 
 # -------------------- what comes out
@@ -369,14 +365,14 @@ class Monitor:
     ) -> None:
         if not (callable(source) or callable(getattr(source, "grab", None)) or hasattr(source, "__iter__")):
             raise TypeError(f"source: got {source!r}, allowed is one with a method grab, a function, or an iterable")
-        _function("evaluate", evaluate)
-        self._triggers = tuple(triggers)
-        names = [t.name if isinstance(t, Trigger) else t for t in self._triggers]
-        if not all(isinstance(t, Trigger) for t in self._triggers) or len(set(names)) < len(names):
+        function("evaluate", evaluate)
+        self._triggers = tuple(instances("triggers", triggers, Trigger))
+        names = [trigger.name for trigger in self._triggers]
+        if len(set(names)) < len(names):
             raise TypeError(f"triggers: got {names}, allowed are Triggers of different names")
         self._source, self._evaluate, self._log_particles = source, evaluate, log_particles
         self._example = None if example is None else real_array("example", example, 2)
-        self._log_path, self._log = log, None
+        self._log_path, self._log = None if log is None else check_path("log", log), None
         self._shape = None if self._example is None else self._example.shape
         self._changed, self._stopping, self._finished = Condition(), Event(), Event()
         self._slot: tuple[int, Frame] | None = None

@@ -6,12 +6,14 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "images": ["Images", "open_images", "open_scan"],
+        "images": ["Images", "mean_image", "open_images", "open_scan"],
         "beads": ["ScanReport", "find_beads"],
+        "errors": ["with_errors"],
         "quality": ["depth_quality", "report"],
         "settings": ["Settings", "choose_settings"],
         "measuring": ["Measured", "measure"],
         "stream": ["batch_to_parquet"],
+        "surface": ["flattened"],
         "tables": ["in_um", "save_points", "save_table"],
     },
 )

@@ -47,6 +47,15 @@ LEAST_CORRELATION = 0.9
 """Correlation of a bead's images with the average bead's, in the mean over depth, below which it is an outlier. Chosen
 between 0.8 and 0.97 on the planar and the synthetic scan, where the same 15 and 14 beads are used."""
 
+ALIKE = 0.85
+"""Median correlation of the beads with the average bead below which they do not go through focus together: what was
+given as a scan is a film. Chosen on two scans, also with noise of 300 counts (0.97 or more), and on films of the
+paper's channel and of a vortex at three speeds each (0.75 or less)."""
+
+WANDERS = 0.25
+"""Drift of a bead that is the only one, as a fraction of a template, from which on it is taken for a particle that
+flows. Chosen on the same: 0.02 or less in scans, 0.31 or more in films. As `quality.DRIFT`."""
+
 MOST_LAG = 0.1
 """Largest shift of a bead along z, as a fraction of the scan, to the average bead: one that needs more is an outlier.
 Convention: its images at a tenth of the depths, at one end, would be made up from the slice at the end."""
@@ -415,7 +424,7 @@ def _averaged(
         raise ValueError(
             f"scan: got {len(beads)} beads, none with {size} px to the next and {size // 2 + 2} to the border, needed "
             "is one; give a smaller size, or the position of one in beads_px (also if one bead's spots are taken "
-            "for several), or scan a sparser slide"
+            "for several), or scan a sparser slide (and a film of particles that flow is no scan)"
         )
     clipped = _clipped(scan, beads.loc[looked], size)
     beads.loc[looked, "clipped"] = clipped.sum(axis=1)
@@ -435,7 +444,25 @@ def _averaged(
     beads.loc[kept, "correlation"], beads.loc[kept, "offset_um"] = correlation, -lags * np.median(np.diff(z_um))
     beads.loc[kept, "verdict"] = np.where(used, "used", "an outlier")
     drift = np.mean(np.array(drifts)[used], axis=0)
+    _must_stay(correlation, drift, size, given=given)
     return beads, mean, drift - drift.mean(axis=0), clipped.mean(axis=0)
+
+
+def _must_stay(correlation: NDArray, drift: NDArray, size: int, *, given: bool) -> None:
+    """Refuse a film of particles that flow: beads of a scan stay in place, and change alike.
+
+    From the correlation of beads with their average (b,), and the drift of the average (N, 2), px.
+    """
+    said, wander = "", float(np.ptp(drift, axis=0).max())
+    if len(correlation) > 1 and np.median(correlation) < ALIKE:
+        said = f"{len(correlation)} beads that do not change alike (median correlation {np.median(correlation):.2f})"
+    elif len(correlation) == 1 and not given and wander > WANDERS * size:
+        said = f"a bead that wanders by {wander:.0f} px, in a template of {size} px"
+    if said:
+        raise ValueError(
+            f"scan: got {said}, as in a film of particles that flow; needed are beads that stay in place while the "
+            "stage carries them through focus (if they do, give the positions of good ones in beads_px)"
+        )
 
 
 def _mean(stacks: NDArray, given: bool) -> tuple[NDArray, NDArray, NDArray, NDArray]:

@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import groupby
@@ -16,6 +17,8 @@ import tifffile
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gdptlab._checks import number, real_array, whole
+from gdptlab._checks import path as check_path
+from gdptlab.pipeline import readers
 
 SUFFIXES = (".tif", ".tiff")
 """Ends of the names of files that are looked for in a folder, in lower or upper case."""
@@ -26,9 +29,17 @@ UM = {"m": 1e6, "cm": 1e4, "mm": 1e3, "µm": 1.0, "μm": 1.0, "um": 1.0, "micron
 NUMBER = r"[-+]?[0-9]+(?:[.,][0-9]+)?(?:[eE][-+][0-9]+)?"
 """Regular expression of a number in a file name: with a sign, decimals after a point or a comma, and an exponent."""
 
+RESTING = 0.05
+"""Largest step, as a fraction of the largest, of a stage that stands still. Chosen: stages are set to a hundredth of a
+step or so, and scans are even."""
+
 MOST_CHANNELS = 7
 """Largest number of channels. ImageJ allows no more; a longer axis that says channel is one of time or depth (files
 that tifffile writes for ImageJ, without being told axes, call it channel)."""
+
+STRIDE = 2**32
+"""Number of a plane of the next position, in a file that a reader of `readers` opens, less that of the same plane.
+Derived: no position has as many."""
 
 COLOUR = "for a colour image choose the channel with the particles, or the mean of all, and save it as grey"
 """Advice in the error about a colour image."""
@@ -119,9 +130,17 @@ class Images(Sequence):
         (rows, columns), dtype = self._frame
         for file, locations in groupby(self._locations.tolist(), lambda location: location[0]):
             path, raw, stamp = self._files[file]
+            if stamp not in (None, _stamp(path)):
+                raise ValueError(f"path: got {path.name!r}, which has changed since it was opened: open it again")
+            if path.suffix.lower() in readers.PACKAGES:
+                numbers = [offset for _, offset in locations]
+                with _others_opened(path, numbers[0] // STRIDE) as planes:
+                    for image in planes.read(number % STRIDE for number in numbers):
+                        if (image.shape, image.dtype) != self._frame:
+                            raise _refused(path, f"an image of {_described(image)}", f"are those of {_described(self)}")
+                        yield image
+                continue
             with _opened(path) as tif:
-                if stamp not in (None, _stamp(path)):
-                    raise ValueError(f"path: got {path.name!r}, which has changed since it was opened: open it again")
                 for _, offset in locations:
                     if raw:
                         tif.filehandle.seek(offset)
@@ -146,7 +165,7 @@ class Images(Sequence):
 
 
 def open_images(path: str | os.PathLike[str], *, channel: int | None = None, position: int | None = None) -> Images:
-    """Open grey images in TIFF files, without reading them yet.
+    """Open grey images in TIFF files, or in others that `readers` knows, without reading them yet.
 
     Arrays of any kind (memory maps, dask arrays, sequences of pims) need no opening: `batch` takes them as they are.
 
@@ -156,11 +175,13 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
         A file of one or more images (OME-TIFF and ImageJ included; a set of OME-TIFFs by any one of them), a folder
         of such files, or a folder and a pattern, as in "film/*_green.tif". Where the first holds one image, so must
         all. Files are sorted by name, numbers in it by their value: frame2 before frame10. Where the names give depths
-        (as `open_scan` reads them: z_-50, z_0, z_50) the files are sorted by depth.
+        (as `open_scan` reads them: z_-50, z_0, z_50) the files are sorted by depth. Or, with ``pip install
+        gdptlab[formats]``, one file of Nikon's (.nd2), Zeiss's (.czi) or Leica's (.lif), or a grey video (.avi, .mp4,
+        .mov; of one in colour the brightness).
     channel : int, optional
         Number of the channel, from 0, in files that have several.
     position : int, optional
-        Number of the position on the slide, from 0, in OME-TIFFs that have several.
+        Number of the position on the slide (scene, image), from 0, in files that have several.
 
     Returns
     -------
@@ -183,13 +204,14 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
     >>> frames.shape, frames[1].dtype
     ((3, 512, 512), dtype('uint16'))
     """
-    if not isinstance(path, str | os.PathLike):
-        raise TypeError(f"path: got a {type(path).__name__}, allowed is the path of a file or a folder")
+    path = check_path("path", path)
     chosen = {
         name: None if value is None else whole(name, value, 0, 10_000)
         for name, value in (("channel", channel), ("position", position))
     }
-    paths = _paths(Path(path).absolute())
+    paths = _paths(path.absolute())
+    if paths[0].suffix.lower() in readers.PACKAGES:
+        return _others(paths[0], chosen["channel"], chosen["position"])
     number, files, locations, frame, um_per_px = {}, [], [], None, None
     for path in paths:
         if path in number:  # a part of a set of OME-TIFFs
@@ -215,6 +237,26 @@ def open_images(path: str | os.PathLike[str], *, channel: int | None = None, pos
     return Images(files, np.array(locations, dtype=np.int64), frame, um_per_px)
 
 
+def mean_image(path: str | os.PathLike[str]) -> NDArray[np.float32]:
+    """Mean (rows, columns) of all images in a file or a folder, such as those of a dark or a flat exposure.
+
+    Parameters
+    ----------
+    path
+        As for `open_images`.
+
+    Raises
+    ------
+    TypeError, FileNotFoundError, ValueError
+        As `open_images`.
+    """
+    images = open_images(path)
+    total = np.zeros(images.shape[1:])
+    for image in images:
+        total += image
+    return (total / len(images)).astype(np.float32)
+
+
 def open_scan(
     path: str | os.PathLike[str],
     *,
@@ -224,7 +266,7 @@ def open_scan(
     names: str | None = None,
     channel: int | None = None,
     position: int | None = None,
-) -> tuple[Images, NDArray[np.float64]]:
+) -> tuple[Images | NDArray[np.float32], NDArray[np.float64]]:
     """Open the images of a calibration scan, and find their depths.
 
     The depths come from where they begin and the step between two images; from a CSV file; or, if neither is given,
@@ -239,7 +281,7 @@ def open_scan(
         Depth of the first image, and from each to the next (negative if the scan went down).
     csv : str or path-like, optional
         A table with a column `z_um` and a row for each image, in their order. With semicolons between the columns,
-        decimals follow a comma.
+        decimals follow a comma. Images at either end between which the stage stood still are averaged, with a warning.
     names : str, optional
         A regular expression that finds the depth, µm, in a file name as its only group, as in r"_z(-?[0-9.]+)um".
     channel, position : int, optional
@@ -248,7 +290,7 @@ def open_scan(
     Returns
     -------
     images : Images
-        By increasing depth.
+        By increasing depth; an array (n, rows, columns) if some were averaged.
     z_um : float array (n,)
 
     Raises
@@ -274,6 +316,8 @@ def open_scan(
         real_array("start_um, step_um", z_um, 1)
     elif csv is not None:
         z_um = _depths_of_table(csv, len(images))
+        images, z_um = _without_rests(images, z_um)
+        _unrepeated("csv", z_um)
     else:
         z_um = _depths_of_names(images.names, names)
     order = np.argsort(z_um, kind="stable")
@@ -298,7 +342,28 @@ def _depths_of_table(path: str | os.PathLike[str], n: int) -> NDArray[np.float64
             f"{n} images"
         )
     real_array("csv", table["z_um"], 1)
-    return _unrepeated("csv", table["z_um"].to_numpy(dtype=np.float64))
+    return table["z_um"].to_numpy(dtype=np.float64)
+
+
+def _without_rests(
+    images: Images, z_um: NDArray[np.float64]
+) -> tuple[Images | NDArray[np.float32], NDArray[np.float64]]:
+    """Images and depths (n,); those at which the stage stood still at either end are averaged, with a warning."""
+    steps = np.abs(np.diff(z_um))
+    moving = np.flatnonzero(steps > RESTING * steps.max(initial=0))
+    if not len(moving):
+        return images, z_um
+    first, last = int(moving[0]), int(moving[-1]) + 1  # the last image before the stage moves, the first after
+    if first == 0 and last == len(z_um) - 1:
+        return images, z_um
+    warnings.warn(
+        f"csv: the stage stood still at {z_um[first]:g} µm in {first + 1} images and at {z_um[last]:g} µm in "
+        f"{len(z_um) - last}: they are averaged",
+        stacklevel=3,
+    )
+    parts = [slice(0, first + 1), *(slice(k, k + 1) for k in range(first + 1, last)), slice(last, None)]
+    mean = np.stack([np.mean(np.asarray(images[part]), axis=0, dtype=np.float64) for part in parts])
+    return mean.astype(np.float32), np.array([z_um[part].mean() for part in parts])
 
 
 def _unrepeated(name: str, z_um: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -434,12 +499,48 @@ def _found(
     return [(path.with_name(page.parent.filename), page.offset) for page in pages], False
 
 
+def _others(path: Path, channel: int | None, position: int | None) -> Images:
+    """Images of a file that a reader of `readers` opens."""
+    with _others_opened(path, position or 0) as planes:
+        if position is None and planes.positions > 1:
+            raise _refused(
+                path, f"{planes.positions} positions", f"is one: choose it, position=0 to {planes.positions - 1}"
+            )
+        if position is not None and position >= planes.positions:
+            raise ValueError(f"position: got {position}, allowed are 0 to {planes.positions - 1} in {path.name!r}")
+        number = _chosen(planes.axes, planes.lengths, path, channel)
+        frame = (tuple(planes.shape), planes.dtype)
+    if not len(number):
+        raise _refused(path, "no images", "are files with some")
+    locations = np.stack([np.zeros_like(number), (position or 0) * STRIDE + number], axis=1)
+    return Images([File(path, False, _stamp(path))], locations, frame, planes.um_per_px)
+
+
+@contextmanager
+def _others_opened(path: Path, position: int) -> Iterator[readers.Planes]:
+    """A file that a reader of `readers` opens; what is wrong with it is a ValueError that names it."""
+    try:
+        with readers.opened(path, position) as planes:
+            yield planes
+    except IndexError as error:
+        raise ValueError(f"position: got {position}, which is not in {path.name!r}") from error
+    except Exception as error:  # of many kinds
+        if re.match("(path|channel|position): got", str(error)):
+            raise
+        raise ValueError(f"path: got {path.name!r}, which cannot be read: {error}") from error
+
+
 def _of_channel(series: tifffile.TiffPageSeries, path: Path, channel: int | None) -> NDArray[np.int64]:
     """Numbers of the images, in the order of the file, that belong to a channel of a series."""
     axes, shape = series.axes.replace("YX", ""), series.shape[: len(series.axes.replace("YX", ""))]
-    number = np.arange(int(np.prod(shape))).reshape(shape)
     if axes == "C" and shape[0] > MOST_CHANNELS:
         axes = "T"
+    return _chosen(axes, shape, path, channel)
+
+
+def _chosen(axes: str, shape: tuple[int, ...], path: Path, channel: int | None) -> NDArray[np.int64]:
+    """Numbers of the images of a channel, of all along these axes, if beside it they have one axis."""
+    number = np.arange(int(np.prod(shape))).reshape(shape)
     channels = shape[axes.index("C")] if "C" in axes else 1
     if channel is None and channels > 1:
         raise _refused(path, f"{channels} channels", f"is one: choose it, channel=0 to {channels - 1}")
@@ -447,8 +548,8 @@ def _of_channel(series: tifffile.TiffPageSeries, path: Path, channel: int | None
         raise ValueError(f"channel: got {channel}, allowed are 0 to {channels - 1} in {path.name!r}")
     if "C" in axes:
         number, axes = number.take(channel, axis=axes.index("C")), axes.replace("C", "")
-    if len(axes) > 1:
-        kind = f"images along the axes {series.axes} of lengths {series.shape}"
+    if sum(n > 1 for n in number.shape) > 1:
+        kind = f"images along the axes {axes}YX, of lengths {number.shape}"
         raise _refused(path, kind, "is one axis, time or depth, beside channel, rows and columns")
     return number.ravel()
 

@@ -7,7 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gdptlab._checks import positive
-from gdptlab.calibration import Calibration
+from gdptlab.calibration import Calibration, checked
 from gdptlab.denoising import noise_level, signal_to_noise
 from gdptlab.fit.bounds import expected_error
 
@@ -28,7 +28,7 @@ standard deviations of a pixel hardly anything is visible."""
 NEXT = (0.85, 0.6)
 """Correlations of neighbouring images below which a calibration is looked at, and is bad. Chosen on the sample's stack
 with every 1st to 6th of its images: the correlation falls from 0.99 to 0.86, and the RMS error of z grows from 0.3 % to
-1.0 % of the range of depths. Where images correlate by 0.6, z between them is a guess."""
+1.1 % of the range of depths. Where images correlate by 0.6, z between them is a guess."""
 
 ERROR = (0.02, 0.05)
 """Expected errors of z, as fractions of the range of depths, above which a calibration is looked at, and is bad.
@@ -80,7 +80,7 @@ def depth_quality(calibration: Calibration, noise: float | None = None) -> pd.Da
         highest correlation among those that are not just neighbours its correlation `ambiguous_correlation` and depth
         `ambiguous_um` (NaN if there is none).
     """
-    z_um, correlation = calibration.z_um, calibration.self_similarity()
+    z_um, correlation = checked(calibration).z_um, calibration.self_similarity()
     other = np.array([_ambiguous(row, k) for k, row in enumerate(correlation)])
     none = other < 0
     each = np.arange(len(calibration))
@@ -125,7 +125,7 @@ def report(calibration: Calibration) -> pd.DataFrame:
         A row for each question (the index): `verdict`, "good", "look" or "bad"; `finding`, with numbers; and `advice`,
         empty where all is well.
     """
-    made = calibration.report
+    made = checked(calibration).report
     depths = depth_quality(calibration, made.noise if made else None)
     span = float(calibration.z_um[-1] - calibration.z_um[0])
     error_um = np.hypot(depths["z_std_um"], depths["own_error_um"])
@@ -216,7 +216,7 @@ def _plane(beads: pd.DataFrame, z_um: NDArray, error_um: float) -> Judgement:
     uneven = float(beads.loc[beads["verdict"] == "used", "offset_um"].std(ddof=0))
     step, span = float(np.median(np.diff(z_um))), z_um[-1] - z_um[0]
     finding = f"beads come into focus {uneven:.2g} µm apart (RMS over the field)"
-    advice = "The field is curved or tilted, which goes into z unless it is corrected."
+    advice = "The field is curved or tilted, which goes into z unless it is corrected (`flattened`, or field=True)."
     look = uneven > max(step / 2, error_um)
     return Judgement("the plane of beads", bool(uneven > UNEVEN * span), look, finding, advice)
 

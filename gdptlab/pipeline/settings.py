@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, image_array, positive, whole
+from gdptlab._checks import choice, image_array, iterable, positive, whole
 from gdptlab.calibration import Calibration
 from gdptlab.denoising import noise_level
 from gdptlab.fit.pattern import particle_light
@@ -31,8 +31,8 @@ DEPTHS = 25
 with the same thresholds; the time grows with the number."""
 
 EVEN = 0.2
-"""Largest spread of the amplitudes, as a fraction of their median, with which the joint fit is chosen. Derived: it
-takes amplitudes to be equal, and a fifth is what its prior allows for."""
+"""Largest standard deviation of the amplitudes, as a fraction of their median, with which the joint fit is chosen.
+Derived: it takes amplitudes to be equal, and a fifth is what its prior allows for."""
 
 EXPLAINED = 1.5
 """Largest median chi2 of particles with which the joint fit is chosen. Derived: it is 1 where the model holds."""
@@ -98,7 +98,7 @@ def choose_settings(
         finds are false, to judge by the frames with their sign turned and by the side-lobes of lone particles.
     method : str, optional
         "correlation" or "joint". If not given, joint where its model holds: where it finds particles of even
-        amplitude (spread at most `EVEN`) that look like the calibration's (median C_m at least `LEAST_CM`) and
+        amplitude (to `EVEN` at most) that look like the calibration's (median C_m at least `LEAST_CM`) and
         explains what is around them (median chi2 at most `EXPLAINED`).
     refine : bool, optional
         Of "correlation"; True if not given.
@@ -107,7 +107,7 @@ def choose_settings(
     false_fraction : float
         Fraction of false finds that is put up with.
     looked_at : int
-        How many frames are looked at.
+        How many frames are looked at; for the method, which takes longest, the middle one of them.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def choose_settings(
         raise ValueError("frames: got none, needed is one or more")
     others = {name: value for name, value in given.items() if name != "threshold"}
     found, false = (_found([sign * frame for frame in looked], calibration, others) for sign in (1, -1))
-    side_lobes, alone = _side_lobes(calibration, noise_level(looked[0]), others)
+    side_lobes, alone = _side_lobes(calibration, noise_level(looked[len(looked) // 2]), others)
     reasons = {"refine": "the whole stack is walked", "min_distance_px": "a quarter of a template"}
     if threshold is None:
         finds = (table["cm"] for table in (found, false, side_lobes, alone))
@@ -140,7 +140,7 @@ def choose_settings(
     elif given:
         method, reasons["method"] = "correlation", "only it has the settings given"
     else:
-        method, reasons["method"] = _method(looked[0], calibration)
+        method, reasons["method"] = _method(looked[len(looked) // 2], calibration)
     arguments = {"method": method}
     if method == "correlation":
         arguments |= {"threshold": threshold, "refine": True, "min_distance_px": calibration.size / 4} | given
@@ -154,13 +154,11 @@ def choose_settings(
 
 def _spread(frames: Iterable[ArrayLike], n: int) -> list[ArrayLike]:
     """Up to `n` frames (rows, columns), evenly spread over a sequence, the first of anything else."""
-    if hasattr(frames, "__len__") and hasattr(frames, "__getitem__") and not isinstance(frames, dict):
+    sequence = hasattr(frames, "__len__") and hasattr(frames, "__getitem__") and not isinstance(frames, dict)
+    if sequence and getattr(frames, "ndim", 1):
         middles = (np.arange(n) + 0.5) * len(frames) / n
         return [frames[k] for k in np.unique(middles.astype(int)).tolist()] if len(frames) else []
-    try:
-        return list(islice(frames, n))
-    except TypeError as error:
-        raise TypeError(f"frames: got a {type(frames).__name__}, allowed is an iterable of arrays") from error
+    return list(islice(iterable("frames", frames), n))
 
 
 def _must_go_together(method: str | None, given: dict[str, object]) -> None:
@@ -220,10 +218,10 @@ def _method(frame: NDArray, calibration: Calibration) -> tuple[str, str]:
         return "correlation", "too few particles to see if they have equal amplitudes, as joint takes them to have"
     amplitude, chi2 = table["amplitude"], float(table["chi2"].median())
     # Of normal numbers, the standard deviation; a few far brighter particles change it, as they should.
-    spread = float((amplitude.quantile(0.9) - amplitude.quantile(0.1)) / (2.563 * amplitude.median()))
+    scatter = float((amplitude.quantile(0.9) - amplitude.quantile(0.1)) / (2.563 * amplitude.median()))
     cm = float(table["cm"].median())
-    method = "joint" if spread <= EVEN and chi2 <= EXPLAINED and cm >= LEAST_CM else "correlation"
+    method = "joint" if scatter <= EVEN and chi2 <= EXPLAINED and cm >= LEAST_CM else "correlation"
     return method, (
-        f"joint finds {len(table)} particles, of equal amplitude to {100 * spread:.0f} %, with a median C_m of "
+        f"joint finds {len(table)} particles, of equal amplitude to {100 * scatter:.0f} %, with a median C_m of "
         f"{cm:.2f}, and leaves a chi2 of {chi2:.1f}"
     )

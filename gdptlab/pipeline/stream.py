@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
+from gdptlab._checks import path as check_path
 from gdptlab._checks import real_array
 from gdptlab._files import written_whole
 from gdptlab.calibration import Calibration
-from gdptlab.locate import BLOCK, blank_table, in_blocks
+from gdptlab.locate import BLOCK, blank_table, in_blocks, prepared
 from gdptlab.pipeline.images import open_images
 from gdptlab.pipeline.tables import about, as_json
+from gdptlab.preparation import Preparation
 
 NOTE = "_about.json"
 """Name of the file that says how the table was made. What reads folders of Parquet skips names that begin with _."""
@@ -40,6 +42,7 @@ def batch_to_parquet(
     *,
     n_jobs: int = 1,
     progress: bool = True,
+    prepare: Preparation | None = None,
     **settings: object,
 ) -> Path:
     """Measure every particle in every frame, as `batch` does, into a folder of Parquet files.
@@ -56,7 +59,7 @@ def batch_to_parquet(
         The same in each call; keep it with `Calibration.save`.
     folder : str or path-like
         Made if it does not exist; the folder above it must.
-    n_jobs, progress, **settings
+    n_jobs, progress, prepare, **settings
         As for `batch`. On a dask cluster too the files are written by the process that calls.
 
     Returns
@@ -74,11 +77,14 @@ def batch_to_parquet(
     """
     frames = open_images(frames) if isinstance(frames, str | os.PathLike) else frames
     columns = list(blank_table(calibration, n_jobs, settings))
-    folder = _claimed(folder, about(calibration, settings) | _film(frames))
+    frames, prepare = prepared(frames, calibration, prepare)
+    done_before = {} if prepare is None else {"prepared": prepare.note()}
+    folder = _claimed(folder, about(calibration, settings) | _film(frames) | done_before)
     done = _whole_parts(folder)
     with tqdm(total=len(frames), initial=sum(done.values()), desc="frames", unit="frame", disable=not progress) as bar:
         for first, n, table in in_blocks(frames, calibration, n_jobs, settings, done):
             part = _part(folder, first, n)
+            table = table if prepare is None else prepare.restored(table)
             with written_whole(part) as temporary:
                 table[columns].to_parquet(temporary, index=False)
                 _on_disk(temporary)
@@ -144,9 +150,7 @@ def _comparable(note: dict[str, object]) -> dict[str, object]:
 
 def _claimed(folder: str | os.PathLike[str], note: dict[str, object]) -> Path:
     """Path of the folder, which is new or holds a table that was made as the note says."""
-    if not isinstance(folder, str | os.PathLike):
-        raise TypeError(f"folder: got a {type(folder).__name__}, allowed is the path of a folder")
-    folder, note = Path(folder), json.loads(as_json(note))
+    folder, note = check_path("folder", folder), json.loads(as_json(note))
     if not folder.parent.is_dir():
         raise FileNotFoundError(f"folder: got {str(folder)!r}, allowed is one in a folder that exists")
     if folder.exists() and not folder.is_dir():

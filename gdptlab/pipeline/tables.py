@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 from inspect import signature
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -65,8 +64,10 @@ def about(calibration: Calibration, settings: dict[str, object]) -> dict[str, ob
     settings = unsaid | settings
     if settings["method"] == "correlation" and settings["threshold"] is None:
         settings["threshold"] = THRESHOLD
-    return {
+    camera = {} if calibration.camera is None else {"camera": calibration.camera.note()}
+    return camera | {
         "calibration": fingerprint(calibration),
+        "depth_factor": calibration.depth_factor,
         "settings": settings,
         "sources": sources_digest(),
         "versions": versions(),
@@ -109,7 +110,7 @@ def save_table(table: pd.DataFrame, path: str | os.PathLike[str], calibration: C
     FileNotFoundError
         If there is no such folder.
     """
-    path = _path(path, (".csv", ".parquet"))
+    path = check.path("path", path, ".csv", ".parquet")
     check.table("table", table, ())
     note = as_json(about(calibration, settings))
     write = table.to_csv if path.suffix == ".csv" else table.to_parquet
@@ -149,7 +150,7 @@ def save_points(
     FileNotFoundError
         If there is no such folder.
     """
-    path = _path(path, (".csv",))
+    path = check.path("path", path, ".csv")
     check.choice("program", program, POINTS)
     check.table("table", table, ("x_px", "y_px", "z_um"))
     scale = 1.0 if um_per_px is None else check.positive("um_per_px", um_per_px)
@@ -167,12 +168,3 @@ def save_points(
     with written_whole(path) as temporary:
         points = pd.DataFrame(points).set_axis(range(first, first + len(table)))
         points.to_csv(temporary, index_label=name_of_row)
-
-
-def _path(path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> Path:
-    """Path of a file, if its name ends in one of these suffixes."""
-    if not isinstance(path, str | os.PathLike):
-        raise TypeError(f"path: got a {type(path).__name__}, allowed is the path of a file")
-    if Path(path).suffix not in suffixes:
-        raise ValueError(f"path: got {Path(path).name!r}, allowed are names that end in {' or '.join(suffixes)}")
-    return Path(path)

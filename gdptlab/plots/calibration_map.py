@@ -166,8 +166,8 @@ def profile_match(figure: Figure | SubFigure, profile: NDArray, calibration: Cal
     left.legend(loc="lower center", fontsize="small")
     right.plot(z_um, agreement, color=COLOURS[0])
     right.plot(z_um[best], agreement[best], "o", color=MARK, ms=7)
-    right.annotate(f"{depth_label(z_um[best])} µm", (z_um[best], agreement[best]), (6, -14), textcoords="offset points")
-    right.set(xlabel="z of the expected profile (µm)", ylabel="agreement", title="z is where the two agree best")
+    title = f"z is where the two agree best: {depth_label(z_um[best])} µm"
+    right.set(xlabel="z of the expected profile (µm)", ylabel="agreement", title=title)
 
 
 def correlation_peak(

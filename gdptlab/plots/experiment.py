@@ -16,12 +16,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from gdptlab.experiment.channel import Channel, Trajectories
+from gdptlab.experiment.channel import IN_CHANNEL, Channel, Trajectories
 from gdptlab.experiment.film import Film
 from gdptlab.plots.style import COLOURS, DEPTH, GREY, STYLE, bare, scale_bar, stretched, styled
 
 TRIGGERS = {"h": "$t_{h/3}$", "w": "$t_{w/3}$"}
 """Symbols of the two triggers."""
+
+TRIGGER_TITLES = {"h": "Height: $t_{h/3}$", "w": "Width: $t_{w/3}$"}
+"""The same with a word that is legible in a small title."""
 
 TRIGGER_COLOURS = {"h": COLOURS[0], "w": COLOURS[1]}
 """Colours of the two triggers."""
@@ -71,14 +74,14 @@ def _device(axes: Axes, channel: Channel) -> None:
     axes.set(xlim=(-0.7 * w, 0.66 * w), ylim=(low - 0.7 * h, 0.85 * h), xticks=[], yticks=[])
 
 
-def _paths(figure: Figure, paths: Trajectories) -> None:
+def draw_paths(figure: Figure, paths: Trajectories) -> None:
     """Draw the particles' paths through the field of view, coloured by time."""
     channel, duration = paths.focusing.channel, paths.duration_s
     w, h, length = channel.width_um, channel.height_um, paths.view_length_um
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
     times = np.linspace(0, duration, 61)
     table = paths.table(times, border_um=np.inf)
-    points = table[["x_um", "y_um", "z_um"]].to_numpy().reshape(len(times), -1, 3)
+    points = table[list(IN_CHANNEL.values())].to_numpy().reshape(len(times), -1, 3)
     parts = np.stack([points[:-1], points[1:]], axis=2)  # (times - 1, particles, 2 ends, 3)
     seen = ((parts[..., 0] >= 0) & (parts[..., 0] <= length)).all(axis=-1)
     when = np.broadcast_to(times[:-1, None], seen.shape)[seen]
@@ -128,13 +131,13 @@ def fig4_acoustophoresis(paths: Trajectories, seen: Trajectories, times_s: Mappi
     ):
         part.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=11)
     _device(left.subplots(), channel)
-    _paths(right, paths)
+    draw_paths(right, paths)
     panels = lower.subplots(1, len(times_s), sharey=True, squeeze=False)[0]
     for panel, (name, t) in zip(panels, times_s.items(), strict=True):
         here = seen.positions(t)
         limit_to_channel(panel, channel)
-        panel.plot(here["y_um"], here["z_um"], "o", color="black", ms=2.5)
-        inside = {"h": np.abs(here["z_um"]) <= h / 6, "w": np.abs(here["y_um"]) <= w / 6}
+        panel.plot(here["y_channel_um"], here["z_um"], "o", color="black", ms=2.5)
+        inside = {"h": np.abs(here["z_um"]) <= h / 6, "w": np.abs(here["y_channel_um"]) <= w / 6}
         panel.set_title(f"{name}: {t:.2g} s", loc="center")
         fractions = ",  ".join(f"{fraction.mean():.0%} in {a}/3" for a, fraction in inside.items())
         panel.set(xlabel=f"y (µm)\n{fractions}", xticks=(-w / 2, 0, w / 2), yticks=(-h / 2, 0, h / 2))
@@ -172,8 +175,8 @@ def _draw_moment(figure: Figure, film: Film, measured: pd.DataFrame, monitor: pd
     bare(picture)
     scale_bar(picture, scope.um_per_px, 50)
     limit_to_channel(section, channel)
-    section.plot(true["y_um"], true["z_um"], "x", color="0.35", ms=5)
-    section.scatter(here["y_um"], here["z_um"], c=here["z_um"], cmap=DEPTH, vmin=-half, vmax=half, s=26)
+    section.plot(true["y_channel_um"], true["z_um"], "x", color="0.35", ms=5)
+    section.scatter(here["y_channel_um"], here["z_um"], c=here["z_um"], cmap=DEPTH, vmin=-half, vmax=half, s=26)
     section.set(xlabel="y (µm)", ylabel="z (µm)", title=f"{len(here)} measured (dots) of {len(true)} (crosses)")
     draw_monitor(curves, monitor[monitor["frame"] <= frame])
     curves.set_xlim(0, monitor["t_s"].max())

@@ -88,11 +88,13 @@ def draw_in_space(
     x, y, z = particles["x_px"] * um_per_px, particles["y_px"] * um_per_px, particles["z_um"]
     low, high = z_limits_um
     dots = axes.scatter(x, y, z, c=z, cmap=DEPTH, vmin=low, vmax=high, s=42, depthshade=False, label="measured")
-    axes.set(xlabel="x (µm)", ylabel="y (µm)", zlabel="z (µm)", zlim=z_limits_um)
+    axes.set_xlabel("x (µm)", labelpad=9)
+    axes.set_ylabel("y (µm)", labelpad=11)
+    axes.set(zlabel="z (µm)", zlim=z_limits_um)
     axes.set(zticks=np.linspace(low, high, 3))
     axes.yaxis.set_inverted(True)  # as in the image
     spans = [np.diff(limits).item() for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
-    axes.set_box_aspect(np.abs(spans), zoom=0.92)
+    axes.set_box_aspect(np.abs(spans), zoom=1.02)
     return dots
 
 

@@ -82,7 +82,9 @@ def live_panel(
             rings = axes["frame"].scatter(here["x_px"], here["y_px"], s=120, lw=1.6, c=here["z_um"], **colour)
             rings.set_edgecolor(rings.to_rgba(here["z_um"]))
             rings.set_facecolor("none")
-            axes["section"].scatter(here["y_um"], here["z_um"], c=here["z_um"], s=18, ec="0.3", lw=0.4, **colour)
+            axes["section"].scatter(
+                here["y_channel_um"], here["z_um"], c=here["z_um"], s=18, ec="0.3", lw=0.4, **colour
+            )
     _fractions(axes["fractions"], recent, level, seconds)
     _latencies(axes["late"], recent, seconds)
     axes["words"].axis("off")

@@ -35,7 +35,7 @@ def found_and_left(
     true: pd.DataFrame,
     measured: Mapping[str, pd.DataFrame],
     pairs: Mapping[str, pd.DataFrame],
-    left: Mapping[str, NDArray],
+    residuals: Mapping[str, NDArray],
 ) -> Figure:
     """Show what methods find in a frame, and below the residual.
 
@@ -48,8 +48,8 @@ def found_and_left(
         The same, by the method's name.
     pairs : dict of DataFrame
         From `assessment.match`.
-    left : dict of arrays (rows, columns)
-        The frame less the light of what was measured, in units of the noise of a pixel.
+    residuals : dict of arrays (rows, columns)
+        The frame less the model image of what was measured, in units of the noise of a pixel.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def found_and_left(
             upper.scatter(here["x_px"], here["y_px"], **look)
         counts = ", ".join(f"{len(here)} {kind}" for kind, here in groups.items())
         upper.set_title(f"{name}: {counts}")
-        shown = lower.imshow(left[name], vmin=-RESIDUAL_END, vmax=RESIDUAL_END, cmap=RESIDUAL)
+        shown = lower.imshow(residuals[name], vmin=-RESIDUAL_END, vmax=RESIDUAL_END, cmap=RESIDUAL)
         lower.set_title("residual")
         lower.set(xlabel="x (px)")
         lower.spines[:].set_visible(True)
@@ -90,12 +90,12 @@ def found_and_left(
 
 @styled
 def laid_bare(rows: Mapping[str, Sequence[NDArray]], titles: Sequence[str], um_per_px: float) -> Figure:
-    """Show particles that others hide, once the light of those others is taken away.
+    """Show particles that others hide, once the model images of those others are subtracted.
 
     Parameters
     ----------
     rows : dict of sequences of arrays (n, n)
-        By the particle's name: the frame less its background, the others' light, the difference of the two, and the
+        By the particle's name: the frame less its background, the others' model image, the difference, and the
         particle's image alone. The first two have one scale of grey, and so have the last two.
     titles : sequence of str
         Of the four columns.
@@ -134,7 +134,7 @@ def error_ratios(ratios: Mapping[str, pd.DataFrame], limit: float = 6.0) -> Figu
     Returns
     -------
     Figure
-        The scale of density is logarithmic, to show the tails. Spreads are written above.
+        The scale of density is logarithmic, to show the tails. Standard deviations are written above.
     """
     columns = list(next(iter(ratios.values())))
     figure, [axes] = panels(len(columns), 10, 3.9, sharey=True)

@@ -118,8 +118,8 @@ def _beads(axes: Axes, made: ScanReport) -> None:
             path_effects=stroke,
         )
     for bead in made.beads.head(NUMBERED).itertuples():
-        place = {"textcoords": "offset points", "xytext": (6, 6), "fontsize": "small", "color": "white"}
-        axes.annotate(str(bead.Index), (bead.x_px, bead.y_px), **place, path_effects=stroke)
+        style = {"textcoords": "offset points", "xytext": (6, 6), "fontsize": "small", "color": "white"}
+        axes.annotate(str(bead.Index), (bead.x_px, bead.y_px), **style, path_effects=stroke)
     axes.set(xlabel="x (px)", ylabel="y (px)", title="Beads of the scan, where it is sharpest")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), fontsize="small", frameon=False)
 

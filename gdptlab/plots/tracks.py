@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gdptlab.experiment.channel import Focusing
+from gdptlab.experiment.channel import IN_CHANNEL, Focusing
 from gdptlab.experiment.film import Film
 from gdptlab.plots.experiment import limit_to_channel
 from gdptlab.plots.style import COLOURS, DEPTH, MARK, grey, panels, scale_bar, styled
@@ -45,12 +45,12 @@ def tracks_in_space(film: Film, tracks: pd.DataFrame, frame: int) -> Figure:
         [["frame", "section"]], figsize=(11, 4.4), layout="constrained", width_ratios=[1, 1.5]
     )
     limit_to_channel(axes["section"], channel)
-    dots = axes["section"].scatter(begin["y_um"], begin["z_um"], c=begin["z_um"], s=16, zorder=2, **limits)
+    dots = axes["section"].scatter(begin["y_channel_um"], begin["z_um"], c=begin["z_um"], s=16, zorder=2, **limits)
     axes["frame"].imshow(image, **grey(image))
     for particle, track in past.groupby("particle"):
         colour = dots.to_rgba(begin["z_um"][particle])
         axes["frame"].plot(track["x_px"], track["y_px"], color=colour, lw=1.3)
-        axes["section"].plot(track["y_um"], track["z_um"], color="0.6", lw=0.8, zorder=1)
+        axes["section"].plot(track["y_channel_um"], track["z_um"], color="0.6", lw=0.8, zorder=1)
     now = past[past["frame"] == frame]
     colours = begin["z_um"][now["particle"]]
     axes["frame"].scatter(now["x_px"], now["y_px"], c=colours, s=16, ec="white", lw=0.6, zorder=3, **limits)
@@ -74,7 +74,7 @@ def one_track(track: pd.DataFrame, path: pd.DataFrame, frame_rate_hz: float) -> 
     track : DataFrame
         One particle of `tracks.velocities`.
     path : DataFrame
-        The true one: `frame`, `x_um`, `y_um`, `z_um`, `vx_um_s`, `vy_um_s`, `vz_um_s`.
+        The true one: `frame`, `x_channel_um`, `y_channel_um`, `z_um`, `vx_um_s`, `vy_um_s`, `vz_um_s`.
     frame_rate_hz : float
 
     Returns
@@ -86,7 +86,7 @@ def one_track(track: pd.DataFrame, path: pd.DataFrame, frame_rate_hz: float) -> 
     t, true_t = (table["frame"] / frame_rate_hz for table in (track, path))
     for k, axis in enumerate("xyz"):
         for panel, name, std in (
-            (axes[0, k], f"{axis}_um", f"{axis}_std_um"),
+            (axes[0, k], IN_CHANNEL[axis], f"{axis}_std_um"),
             (axes[1, k], f"v{axis}_um_s", f"v{axis}_std_um_s"),
         ):
             panel.plot(true_t, path[name], color="black", lw=1, label="true", zorder=3)
@@ -99,14 +99,14 @@ def one_track(track: pd.DataFrame, path: pd.DataFrame, frame_rate_hz: float) -> 
     return figure
 
 
-def _binned(axes: Axes, place: NDArray, value: NDArray, edges: NDArray, colour: str, marker: str, label: str) -> None:
+def _binned(axes: Axes, at: NDArray, value: NDArray, edges: NDArray, colour: str, marker: str, label: str) -> None:
     """Median and quartiles of a velocity in bins of position."""
-    groups = pd.Series(value).groupby(pd.cut(pd.Series(place), edges), observed=False)
+    groups = pd.Series(value).groupby(pd.cut(pd.Series(at), edges), observed=False)
     low, middle, high = (groups.quantile(q).to_numpy() for q in (0.25, 0.5, 0.75))
     bars = np.stack([middle - low, high - middle])
-    at = (edges[1:] + edges[:-1]) / 2
+    middles = (edges[1:] + edges[:-1]) / 2
     axes.errorbar(
-        at, middle, yerr=bars, color=colour, marker=marker, ls="", lw=1, capsize=2, ms=5, label=label, zorder=3
+        middles, middle, yerr=bars, color=colour, marker=marker, ls="", lw=1, capsize=2, ms=5, label=label, zorder=3
     )
 
 
@@ -137,22 +137,21 @@ def velocity_profiles(table: pd.DataFrame, focusing: Focusing) -> Figure:
         inside = np.linspace(low, high, 9)
         speed = channel.velocity(y, inside[:, None])
         axes[0, 0].fill_between(y, speed.min(axis=0), speed.max(axis=0), color=COLOURS[k], alpha=0.25, lw=0)
-        _binned(
-            axes[0, 0], part["y_um"], part["vx_um_s"], np.linspace(-w / 2, w / 2, BINS + 1), COLOURS[k], "os"[k], label
-        )
+        edges = np.linspace(-w / 2, w / 2, BINS + 1)
+        _binned(axes[0, 0], part["y_channel_um"], part["vx_um_s"], edges, COLOURS[k], "os"[k], label)
     axes[0, 0].set(xlabel="y (µm)", ylabel="$v_x$ (µm/s)", title="flow: bands, Poiseuille", ylim=(0, None))
     axes[0, 0].legend(fontsize="small", loc="lower center")
-    for panel, axis, place in zip(axes[0, 1:], "yz", (y, z), strict=True):
+    for panel, axis, position in zip(axes[0, 1:], "yz", (y, z), strict=True):
         seen = table[f"v{axis}_um_s"]
-        panel.plot(table[f"{axis}_um"], seen, ".", color="0.7", ms=1, rasterized=True)
+        panel.plot(table[IN_CHANNEL[axis]], seen, ".", color="0.7", ms=1, rasterized=True)
         panel.plot(
-            place,
-            focusing.radiation_velocity(axis, place),
+            position,
+            focusing.radiation_velocity(axis, position),
             color="black",
             label="eq. (1a)" if axis == "y" else "eq. (1b)",
         )
-        edges = np.linspace(place[0], place[-1], BINS + 1)
-        _binned(panel, table[f"{axis}_um"], seen, edges, COLOURS[1], "o", "measured")
+        edges = np.linspace(position[0], position[-1], BINS + 1)
+        _binned(panel, table[IN_CHANNEL[axis]], seen, edges, COLOURS[1], "o", "measured")
         top = 1.6 * focusing.amplitude_um_s(axis)
         panel.set(xlabel=f"{axis} (µm)", ylabel=f"$v_{axis}$ (µm/s)", title=f"sound along {axis}", ylim=(-top, top))
         panel.legend(fontsize="small", loc="upper right")
@@ -206,9 +205,9 @@ def collapsed_paths(
     t_s = tracks["frame"] / frame_rate_hz
     for panel, axis, amplitude in zip(axes[0], "yz", amplitudes_um_s, strict=True):
         extent = focusing.extent_um(axis)
-        place = tracks[f"{axis}_um"].abs()
-        seen = place.between(0.05 * extent, 0.45 * extent)  # elsewhere noise is all there is
-        table = pd.DataFrame({"t": t_s, "v": np.log(np.tan(np.pi * place / extent)), "p": tracks["particle"]})[seen]
+        position = tracks[IN_CHANNEL[axis]].abs()
+        seen = position.between(0.05 * extent, 0.45 * extent)  # elsewhere noise is all there is
+        table = pd.DataFrame({"t": t_s, "v": np.log(np.tan(np.pi * position / extent)), "p": tracks["particle"]})[seen]
         slope = -2 * np.pi * amplitude / extent
         table["v"] -= (table["v"] - slope * table["t"]).groupby(table["p"]).transform("median")
         panel.plot(table["t"], table["v"], ".", color=COLOURS[0], ms=1.2, alpha=0.5, rasterized=True, label="tracks")

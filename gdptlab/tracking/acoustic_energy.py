@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial import KDTree
 
-from gdptlab._checks import positive
+from gdptlab._checks import generator, instance, instances, positive
 from gdptlab._checks import table as check_table
-from gdptlab.experiment.channel import Focusing
+from gdptlab.experiment.channel import IN_CHANNEL, Focusing
 from gdptlab.experiment.film import Film
-from gdptlab.tracking.tracks import POSITION, identify
+from gdptlab.tracking.tracks import frames_of, identify
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t. Convention of robust fits: at 5 standard deviations a residual weighs a sixth of
@@ -46,6 +46,10 @@ little."""
 OFF_WALL, OFF_AXIS = 1e-4, 1e-6
 """Least distances of a position from the walls, where nothing moves, and from the axis, where a derivative is 0 / 0, as
 fractions of the channel's extent. Derived: far below any error of measurement, far above rounding."""
+
+
+POSITION = list(IN_CHANNEL.values())
+"""Columns of a position in the channel."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +76,8 @@ def fit_energy(
     Parameters
     ----------
     tracks : DataFrame
-        From `tracks.link`, of positions that have standard deviations: `frame`, `particle`, `y_um`, `y_std_um`,
-        `z_um`, `z_std_um`. Three tracks or more; those of a single row say nothing.
+        From `tracks.link`, of positions that have standard deviations: `frame`, `particle`,
+        `y_channel_um`, `y_std_um`, `z_um`, `z_std_um`. Three tracks or more; those of a single row say nothing.
     focusing : Focusing
         Channel, suspension, and whether U_z = U_y or U_z = U_y w/h. Its E_ac is where the search begins, no more.
     frame_rate_hz : float
@@ -93,10 +97,9 @@ def fit_energy(
         If an argument is out of range, a column is missing, a standard deviation is not above 0, there are too few
         tracks, or the particles do not move enough for a fit.
     """
-    columns = ["frame", "particle", "y_um", "y_std_um", "z_um", "z_std_um"]
+    columns = ["frame", "particle", "y_channel_um", "y_std_um", "z_um", "z_std_um"]
     check_table("tracks", tracks, columns)
-    if not isinstance(focusing, Focusing):
-        raise TypeError(f"focusing: got {focusing!r}, allowed is a Focusing")
+    instance("focusing", focusing, Focusing)
     rate = positive("frame_rate_hz", frame_rate_hz)
     if not 0 < positive("confidence", confidence) < 1:
         raise ValueError(f"confidence: got {confidence}, allowed is between 0 and 1")
@@ -149,7 +152,7 @@ def _interval(scale: float, rate: _Rate, confidence: float) -> dict[str, float]:
 def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: float) -> _Rate:
     """Gauss-Newton for the rate, and for each track where it was at the middle of its time."""
     extent, start_per_s = focusing.extent_um(axis), 1 / focusing.focusing_time_s(axis)
-    position, std = (tracks[f"{axis}{name}_um"].to_numpy(dtype=float) for name in ("", "_std"))
+    position, std = (tracks[name].to_numpy(dtype=float) for name in (IN_CHANNEL[axis], f"{axis}_std_um"))
     track, number = np.unique(tracks["particle"], return_inverse=True)[1], tracks["particle"].nunique()
 
     def total(values: NDArray) -> NDArray:
@@ -206,7 +209,8 @@ def imitate(
     Parameters
     ----------
     tracks : DataFrame
-        From `link`, measured in `film`: `frame`, `particle`, positions in px and µm, and standard deviations in µm.
+        From `link`, measured in `film`: `frame`, `particle`, positions in px and in the channel, and standard
+        deviations in µm.
     film : Film
     others : iterable of Film
         Of the same length, frame rate and view as `film`; about as many particles.
@@ -215,12 +219,13 @@ def imitate(
     Yields
     ------
     DataFrame
-        `frame`, `particle`, and positions and standard deviations in µm.
+        `frame`, `particle`, positions in the channel and their standard deviations in µm.
     """
     stds = [f"{axis}_std_um" for axis in "xyz"]
     check_table("tracks", tracks, ["frame", "particle", "x_px", "y_px", *POSITION, *stds])
-    rng = np.random.default_rng(rng)
-    here, start = _paths(film)
+    frames_of("tracks", tracks)
+    rng = generator("rng", rng)
+    here, start = _paths(instance("film", film, Film))
     who = pd.Series(identify(tracks, film.truth()))
     owner = who.groupby(tracks["particle"].to_numpy()).agg(lambda part: part.mode().iloc[0])
     lent = tracks.rename(columns={"particle": "track"})[["frame", "track", *POSITION, *stds]]
@@ -230,8 +235,10 @@ def imitate(
     for name in POSITION:
         lent[name] -= lent.pop(f"{name}_true")
     start = start.loc[np.unique(lent["lender"])]
+    if start.empty:
+        raise ValueError("tracks: got none of a particle of the film, needed is one or more")
     tree = KDTree(start)
-    for other in others:
+    for other in instances("others", others, Film):
         there, borrowers = _paths(other)
         near = tree.query(borrowers, k=3)[1]
         chosen = start.index.to_numpy()[rng.permuted(near, axis=1)[:, 0]]
@@ -247,5 +254,5 @@ def imitate(
 def _paths(film: Film) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Of the particles in view: where they are in each frame, and y and z at the start by their number."""
     seen = film.to_channel(film.truth())[["frame", "particle", *POSITION]]
-    start = film.trajectories.start.set_index("particle")[["y_um", "z_um"]]
+    start = film.trajectories.start.set_index("particle")[POSITION[1:]]
     return seen, start.loc[seen["particle"].unique()]

@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab._checks import positive
+from gdptlab._checks import flag, positive
+from gdptlab._checks import path as check_path
 from gdptlab._checks import table as check_table
 from gdptlab._files import written_whole
-from gdptlab.tracking.tracks import POSITION, frames_of, positions_of
+from gdptlab.tracking.tracks import IN_CHANNEL, IN_UM, frames_of, positions_of
 
 VERTEX = 1
 """VTK's number for a cell that is a single point."""
@@ -24,8 +25,8 @@ def save_paraview_tracks(tracks: pd.DataFrame, path: str | os.PathLike[str], fra
     Parameters
     ----------
     tracks : DataFrame
-        `frame`, and `x_um`, `y_um`, `z_um`; all other columns of numbers become values at the points, and those of a
-        velocity, `vx_um_s` and so on, also the vector `velocity`.
+        `frame`, and `x_channel_um`, `y_channel_um`, `z_um`, or `x_um`, `y_um`, `z_um`; all other columns of numbers
+        become values at the points, and those of a velocity, `vx_um_s` and so on, also the vector `velocity`.
     path : str or path-like
         Ends in `.pvd`. The files of the frames are put into a folder of the same name without the ending.
     frame_rate_hz : float
@@ -39,25 +40,24 @@ def save_paraview_tracks(tracks: pd.DataFrame, path: str | os.PathLike[str], fra
         If there is no such folder.
     """
     path, rate = _path(path, ".pvd"), positive("frame_rate_hz", frame_rate_hz)
-    check_table("tracks", tracks, POSITION)
     frames_of("tracks", tracks)
-    positions_of("tracks", tracks)
+    position = _position_um(tracks)
     root, collection = _vtk_file("Collection")
     path.with_suffix("").mkdir(exist_ok=True)
     for frame, part in tracks.groupby("frame"):
         name = f"{path.stem}/{int(frame):06d}.vtu"
-        _write_points(part, path.parent / name)
+        _write_points(part, position, path.parent / name)
         SubElement(collection, "DataSet", timestep=repr(float(frame / rate)), part="0", file=name)
     _write(root, path)
 
 
-def _write_points(part: pd.DataFrame, path: Path) -> None:
+def _write_points(part: pd.DataFrame, position: list[str], path: Path) -> None:
     """Write the particles of a frame as an unstructured grid of single points."""
     n = str(len(part))
     root, grid = _vtk_file("UnstructuredGrid")
     piece = SubElement(grid, "Piece", NumberOfPoints=n, NumberOfCells=n)
-    _add_values(SubElement(piece, "PointData"), part.drop(columns=POSITION))
-    _add_array(SubElement(piece, "Points"), "Points", part[POSITION].to_numpy(dtype=float))
+    _add_values(SubElement(piece, "PointData"), part.drop(columns=position))
+    _add_array(SubElement(piece, "Points"), "Points", part[position].to_numpy(dtype=float))
     cells, each = SubElement(piece, "Cells"), np.arange(len(part))
     _add_array(cells, "connectivity", each)
     _add_array(cells, "offsets", each + 1)
@@ -71,7 +71,7 @@ def save_paraview_field(field: pd.DataFrame, path: str | os.PathLike[str]) -> No
     Parameters
     ----------
     field : DataFrame
-        From `mean_field`, with one to three of `x_um`, `y_um`, `z_um` as its axes.
+        From `mean_field`, with one to three of `x_um`, `y_um`, `z_um` (or of `x_channel_um` and so on) as its axes.
     path : str or path-like
         Ends in `.vtr`.
 
@@ -83,19 +83,20 @@ def save_paraview_field(field: pd.DataFrame, path: str | os.PathLike[str]) -> No
         If there is no such folder.
     """
     path = _path(path, ".vtr")
-    axes = [name for name in POSITION if name in check_table("field", field, ())]
+    position = IN_CHANNEL if set(IN_CHANNEL[:2]) & set(check_table("field", field, ())) else IN_UM
+    axes = [name for name in position if name in field]
     check_table("field", field, axes)
     middles = {name: np.unique(field[name].astype(float)) for name in axes}
     if not axes or len(field) != np.prod([len(middle) for middle in middles.values()]) or field.duplicated(axes).any():
         raise ValueError("field: got rows that are not the cells of a grid, allowed is a table from `mean_field`")
     field = field.sort_values(axes[::-1])  # VTK's first axis is the fastest
-    coordinates = [middles.get(name, np.zeros(1)) for name in POSITION]
+    coordinates = [middles.get(name, np.zeros(1)) for name in position]
     extent = " ".join(f"0 {len(each) - 1}" for each in coordinates)
     root, grid = _vtk_file("RectilinearGrid", WholeExtent=extent)
     piece = SubElement(grid, "Piece", Extent=extent)
     _add_values(SubElement(piece, "PointData"), field.drop(columns=axes))
     parent = SubElement(piece, "Coordinates")
-    for name, each in zip(POSITION, coordinates, strict=True):
+    for name, each in zip(position, coordinates, strict=True):
         _add_array(parent, name, each)
     _write(root, path)
 
@@ -108,7 +109,7 @@ def napari_tracks(
     Parameters
     ----------
     tracks : DataFrame
-        `frame`, `particle`, and `x_px`, `y_px` (or, `in_um`, `x_um`, `y_um`, `z_um`).
+        `frame`, `particle`, and `x_px`, `y_px` (or, `in_um`, what `save_paraview_tracks` takes).
     in_um : bool
         Whether tracks lie in space, in µm, or on the frames, in px.
 
@@ -124,22 +125,27 @@ def napari_tracks(
     TypeError, ValueError
         If `tracks` is no table, or a column is missing.
     """
-    axes = ["particle", "frame", *(["z_um", "y_um", "x_um"] if in_um else ["y_px", "x_px"])]
+    axes = ["particle", "frame", *(_position_um(tracks)[::-1] if flag("in_um", in_um) else ["y_px", "x_px"])]
     ordered = check_table("tracks", tracks, axes).sort_values(["particle", "frame"])
     others = [name for name in ordered if name not in axes and ordered[name].dtype.kind in "buif"]
     features = {name: ordered[name].to_numpy(dtype=float) for name in others}
     return ordered[axes].to_numpy(dtype=float), features
 
 
+def _position_um(tracks: pd.DataFrame) -> list[str]:
+    """Columns of positions in µm, in the channel or not, if tracks have them."""
+    columns = positions_of("tracks", tracks)
+    if columns not in (IN_CHANNEL, IN_UM):
+        raise ValueError(f"tracks: got {', '.join(columns)}, needed are {', '.join(IN_UM)} (see pipeline.in_um)")
+    return columns
+
+
 def _path(path: str | os.PathLike[str], suffix: str) -> Path:
     """Path of a file, if it has this suffix."""
-    if not isinstance(path, str | os.PathLike):
-        raise TypeError(f"path: got a {type(path).__name__}, allowed is the path of a file")
-    if Path(path).suffix != suffix:
-        raise ValueError(f"path: got {Path(path).name!r}, allowed are names that end in {suffix}")
-    if not Path(path).parent.is_dir():
+    path = check_path("path", path, suffix)
+    if not path.parent.is_dir():
         raise FileNotFoundError(f"path: got {str(path)!r}, allowed is one in a folder that exists")
-    return Path(path)
+    return path
 
 
 def _vtk_file(kind: str, **attributes: str) -> tuple[Element, Element]:

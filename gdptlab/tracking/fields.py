@@ -142,8 +142,9 @@ def mean_squared_displacement(tracks: pd.DataFrame, frame_rate_hz: float, *, lon
     columns, rate = positions_of("tracks", tracks), positive("frame_rate_hz", frame_rate_hz)
     if not tracks.duplicated("particle").any():
         raise ValueError("tracks: got none of two or more rows, needed is one")
-    found = trackpy.emsd(
-        tracks, 1.0, rate, max_lagtime=whole("longest", longest, 1, 10**6), detail=True, pos_columns=columns
-    )
-    made = {"lag_s": found["lagt"]} | {f"msd_{column}2": found[f"<{column}^2>"] for column in columns}
+    floats, most = tracks.astype(dict.fromkeys(columns, float)), whole("longest", longest, 1, 10**6)
+    found = trackpy.emsd(floats, 1.0, rate, max_lagtime=most, detail=True, pos_columns=columns)
+    made = {"lag_s": found["lagt"]} | {
+        f"msd_{column[0]}_{column.rpartition('_')[2]}2": found[f"<{column}^2>"] for column in columns
+    }
     return pd.DataFrame(made | {"n": found["N"]}).reset_index(drop=True)

@@ -21,17 +21,14 @@ from gdptlab._checks import LARGEST, positive, whole
 from gdptlab._checks import table as check_table
 from gdptlab.assessment import match
 
-POSITION = ["x_um", "y_um", "z_um"]
-"""Columns of a position in µm."""
+IN_CHANNEL = ["x_channel_um", "y_channel_um", "z_um"]
+"""Columns of a position in a channel, whose middle is at y = z = 0 (see `experiment.Film.to_channel`)."""
 
-POSITION_PX = ["x_px", "y_px", "z_um"]
-"""Columns of a position in a table that has no µm in the plane."""
+IN_UM = ["x_um", "y_um", "z_um"]
+"""Columns of a position in µm, x and y from the centre of the first pixel (see `pipeline.in_um`)."""
 
-OUTSIDE = 0.1
-"""Largest fraction of positions that may lie outside a channel, by more than the search range. Chosen on a second of
-the paper's experiment, measured by correlation: none of 698 positions from the channel's middle lie there, 86 % of
-those from the first pixel. Larger, a table with another origin passes if its flow is in part of the frame; smaller,
-false finds stop the user."""
+POSITIONS = (IN_CHANNEL, IN_UM, ["x_px", "y_px", "z_um"])
+"""Columns of a position; of a table that has several of these, the first are used."""
 
 LEAST_ROWS = 5
 """Least number of positions in a window from which a velocity is fitted. Derived: a parabola has three coefficients,
@@ -45,22 +42,23 @@ class Flow(Protocol):
     width_um: float
     height_um: float
 
-    def velocity(self, y_um: ArrayLike, z_um: ArrayLike) -> NDArray[np.float64]:
+    def velocity(self, y_channel_um: ArrayLike, z_um: ArrayLike) -> NDArray[np.float64]:
         """Velocity along x (µm/s) at positions across the channel."""
 
 
 def positions_of(name: str, table: pd.DataFrame) -> list[str]:
-    """Columns of the positions in a table: `POSITION` if it has them all, or else `POSITION_PX`.
+    """Columns of the positions in a table: the first of `POSITIONS` that it has all of.
 
     Raises
     ------
     TypeError, ValueError
-        If it is no table, or has neither; if a position is not finite, or beyond 1e12.
+        If it is no table, or has none of them; if a position is not finite, or beyond 1e12.
     """
     check_table(name, table, ())
-    columns = POSITION if set(POSITION) <= set(table) else POSITION_PX
-    if not set(columns) <= set(table):
-        raise ValueError(f"{name}: got columns {list(table)}, needed are {', '.join(POSITION)}, or x_px and y_px")
+    columns = next((columns for columns in POSITIONS if set(columns) <= set(table)), None)
+    if columns is None:
+        allowed = ", or ".join(map(", ".join, POSITIONS))
+        raise ValueError(f"{name}: got columns {list(table)}, needed are {allowed}")
     check_table(name, table, columns)
     if not (table[columns].abs() <= LARGEST).all(axis=None):
         raise ValueError(f"{name}: got positions that are NaN or beyond {LARGEST:g}, allowed are numbers to there")
@@ -103,8 +101,8 @@ def link(
     Parameters
     ----------
     table : DataFrame
-        Positions `x_um`, `y_um`, `z_um` (or, if it does not have these, `x_px`, `y_px`, `z_um`) of each `frame`, a
-        whole number.
+        Positions of each `frame`, a whole number: `x_channel_um`, `y_channel_um`, `z_um`; or, if it does not have
+        these, `x_um`, `y_um`, `z_um`; or `x_px`, `y_px`, `z_um`.
     search_range : (x, y, z)
         Half axes of the ellipsoid, around the expected position, in which a particle is looked for, in the units of
         the positions. To be chosen larger than errors, and than what a particle moves in a frame unpredicted; and
@@ -113,8 +111,8 @@ def link(
     predictor : optional
         Where a particle is expected. None: where it was. "nearest velocity": moved on as the particle nearest to it
         moved between the two frames before (trackpy's), for flows that change little from frame to frame. A `Flow`,
-        such as an `experiment.Channel`: carried by it; positions then are in µm, and y and z from the channel's middle
-        (see `experiment.Film.to_channel`).
+        such as an `experiment.Channel`: carried by it; positions then are those in the channel (see
+        `experiment.Film.to_channel`).
     frame_rate_hz : float, optional
         Needed with a `Flow`.
     memory : int
@@ -131,8 +129,7 @@ def link(
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range, a column is missing, a position is not finite or a frame not whole; with a
-        `Flow`, if more than `OUTSIDE` of the positions lie outside its channel.
+        If an argument is out of range, a column is missing, a position is not finite or a frame not whole.
 
     Examples
     --------
@@ -149,7 +146,7 @@ def link(
     whole("min_rows", min_rows, 1, 2**31)
     if isinstance(predictor, Flow):
         positive("frame_rate_hz", frame_rate_hz)
-        _must_be_in_channel(table, predictor, ranges)
+        check_table("table", table, IN_CHANNEL)
     elif predictor is not None and not (isinstance(predictor, str) and predictor == "nearest velocity"):
         raise TypeError(f"predictor: got {predictor!r}, allowed are None, 'nearest velocity' and a Channel")
     if table.empty:
@@ -167,18 +164,6 @@ def _search_range(search_range: tuple[float, float, float]) -> NDArray[np.float6
     if len(ranges) != 3 or not all(isinstance(r, Real) and 0 < r < np.inf for r in ranges):
         raise ValueError(f"search_range: got {search_range!r}, allowed are three finite numbers above 0: x, y, z")
     return np.array(ranges, dtype=float)
-
-
-def _must_be_in_channel(table: pd.DataFrame, flow: Flow, ranges: NDArray) -> None:
-    """Refuse a table whose positions are not those in the flow's channel."""
-    check_table("table", table, POSITION)
-    half = np.array([flow.width_um, flow.height_um]) / 2
-    outside = (table[["y_um", "z_um"]].abs() > half + ranges[1:]).any(axis=1)
-    if len(table) and outside.mean() > OUTSIDE:
-        raise ValueError(
-            f"table: got y_um, z_um of which {100 * outside.mean():.0f} % lie outside the channel, allowed are those "
-            "measured from its middle (see experiment.Film.to_channel)"
-        )
 
 
 def _linked(
@@ -264,7 +249,8 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float | None = None, *, wind
     """
     must_be_tracks(tracks)
     columns = positions_of("tracks", tracks)
-    stds = [f"{column[0]}_std{column[1:]}" for column in columns]
+    axes = [(column[0], column.rpartition("_")[2]) for column in columns]  # such as x, µm
+    stds = [f"{axis}_std_{unit}" for axis, unit in axes]
     weighted = set(stds) <= set(tracks)
     if whole("window", window, LEAST_ROWS, 1001) % 2 == 0:
         raise ValueError(f"window: got {window}, allowed are odd numbers")
@@ -280,9 +266,8 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float | None = None, *, wind
     weight = tracks[stds].to_numpy(dtype=float) ** -2.0 if weighted else np.ones_like(position)
     fitted, std = _slopes(tracks, t_s, position, weight, window, least=1.0 if weighted else 0.0)
     made = {}
-    for axis, column in enumerate(columns):
-        name, unit = column.split("_")
-        made[f"v{name}_{unit}_s"], made[f"v{name}_std_{unit}_s"] = fitted[:, axis], std[:, axis]
+    for k, (axis, unit) in enumerate(axes):
+        made[f"v{axis}_{unit}_s"], made[f"v{axis}_std_{unit}_s"] = fitted[:, k], std[:, k]
     return tracks.assign(**made)
 
 
@@ -313,7 +298,10 @@ def _slopes(
     enough = number >= LEAST_ROWS
     normal = np.moveaxis(moments[np.add.outer(range(3), range(3))], (0, 1), (-2, -1))[enough]
     right = np.moveaxis(right, 0, -1)[enough]
-    inverse = np.linalg.inv(normal)
+    try:
+        inverse = np.linalg.inv(normal)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("tracks: got times in which no velocity can be told, allowed are those that differ") from error
     fitted = np.einsum("naij,naj->nai", inverse, right)
     chi2 = squares[enough] - (fitted * right).sum(axis=-1)
     excess = np.maximum(chi2 / (number[enough] - 3)[:, None], least)
