@@ -405,13 +405,12 @@ class Calibration:
         return flat @ flat.T
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the calibration to a `.npz` file, whole or not at all.
+        """Write the calibration, with the patterns learned from a whole scan, to a `.npz` file, whole or not at all.
 
         Raises
         ------
         ValueError
-            If the name does not end in .npz, or the calibration has patterns learned from a whole scan (`learned`):
-            the file has no place for them, and without them it would measure otherwise.
+            If the name does not end in .npz.
         """
         from gdptlab.pipeline.calibration_file import write
 
