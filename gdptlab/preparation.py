@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import real_array, whole
+from gdptlab._checks import positions, real_array, whole
 
 BACKGROUNDS = ("median", "minimum")
 """Backgrounds that are taken from the film itself."""
@@ -169,7 +169,13 @@ class Preparation:
         -------
         DataFrame
             The same, without rows outside the mask.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If it is not of that form.
         """
+        positions("table", table, ("x_px", "y_px"))
         left, top = (0, 0) if self.region is None else self.region[:2]
         table = table.assign(x_px=table["x_px"] + left, y_px=table["y_px"] + top)
         if "frame" in table:

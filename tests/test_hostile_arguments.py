@@ -8,8 +8,9 @@ import inspect
 import itertools
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -49,6 +50,12 @@ for (row, column), (k, z) in itertools.product(CENTRES, enumerate(DEPTHS)):
     SCAN[k, row - 4 : row + 5, column - 4 : column + 5] += disc(z)
 
 
+BEADS = pd.DataFrame({"x_px": [9.0, 30, 50, 10, 28, 52], "y_px": [8.0, 9, 11, 40, 45, 38], "offset_um": 0.1})
+REPORT = SimpleNamespace(beads=BEADS.assign(verdict="used"), drift_px=np.zeros((9, 2)), clipped=np.zeros(9), noise=0.1)
+TILTED = replace(CALIBRATION, report=REPORT)
+RESTING = pd.DataFrame(
+    {"frame": [0, 0, 1, 1], "particle": [0, 1, 0, 1], "x_um": [1.0, 7, 1.5, 7.5], "y_um": 0.0, "z_um": [0.0, 4, 2, 6]}
+)
 JOINT = gdptlab.locate(SCAN[3], CALIBRATION, method="joint").assign(frame=0)
 
 
@@ -121,8 +128,14 @@ def calls(folder: Path) -> dict[str, Call]:
         "gdptlab.Calibration.from_bead": call(Calibration.from_bead, "stack", **beads, x_px=26.0, y_px=26.0, n_sub=3),
         "gdptlab.Calibration.from_scan": call(Calibration.from_scan, **beads, beads_px=CENTRES, n_sub=3),
         "gdptlab.Calibration.with_subset": call(CALIBRATION.with_subset, n_sub=3),
+        "gdptlab.Calibration.with_depth_factor": call(CALIBRATION.with_depth_factor, factor=1.33),
+        "gdptlab.Calibration.one_side": call(CALIBRATION.one_side, side="near"),
         "gdptlab.Calibration.save": call(CALIBRATION.save, path=folder / "a.npz"),
         "gdptlab.Calibration.load": call(Calibration.load, path=folder / "made.npz"),
+        "gdptlab.Preparation": call(
+            gdptlab.Preparation, dark=0 * IMAGE, flat=1 + 0 * IMAGE, mask=IMAGE < 9, region=(0, 0, 9, 9)
+        ),
+        "gdptlab.Preparation.restored": call(gdptlab.Preparation(every=2, region=(1, 1, 9, 9)).restored, table=TABLE),
         "gdptlab.locate": call(gdptlab.locate, image=IMAGE, **made),
         "gdptlab.batch": call(gdptlab.batch, "image", frames=[IMAGE, IMAGE], **made, **quiet, threshold=0.5),
         "gdptlab.match": call(gdptlab.match, measured=TABLE, true=TABLE),
@@ -197,6 +210,8 @@ def calls(folder: Path) -> dict[str, Call]:
         "pipeline.depth_quality": call(pipeline.depth_quality, **made),
         "pipeline.find_beads": call(pipeline.find_beads, scan=SCAN, z_um=DEPTHS),
         "pipeline.in_um": call(pipeline.in_um, table=TABLE, um_per_px=0.65),
+        "pipeline.flattened": call(pipeline.flattened, table=TABLE, calibration=TILTED),
+        "pipeline.mean_image": call(pipeline.mean_image, path=film),
         "pipeline.measure": call(
             pipeline.measure,
             *written,
@@ -216,6 +231,8 @@ def calls(folder: Path) -> dict[str, Call]:
         "pipeline.report": call(pipeline.report, **made),
         "pipeline.save_points": call(pipeline.save_points, table=TABLE, path=folder / "points.csv", program="napari"),
         "pipeline.save_table": call(pipeline.save_table, "settings", table=TABLE, path=folder / "table.csv", **made),
+        "pipeline.with_errors": call(pipeline.with_errors, table=TABLE, **made),
+        "tracking.drift": call(tracking.drift, tracks=RESTING, particles=[0, 1]),
         "tracking.fit_energy": call(tracking.fit_energy, tracks=LONG, focusing=FOCUSING, frame_rate_hz=10.0),
         "tracking.identify": call(tracking.identify, "measured", **linked),
         "tracking.imitate": call(imitated, tracks=TRACKS, film=FILM, others=[FILM], rng=1),
@@ -231,6 +248,7 @@ def calls(folder: Path) -> dict[str, Call]:
         "tracking.save_paraview_field": call(tracking.save_paraview_field, field=FIELD, path=folder / "field.vtr"),
         "tracking.save_paraview_tracks": call(tracking.save_paraview_tracks, tracks=TRUTH, path=folder / "tracks.pvd"),
         "tracking.velocities": call(tracking.velocities, tracks=TRACKS, frame_rate_hz=25.0, window=5),
+        "tracking.without_drift": call(tracking.without_drift, table=RESTING, drift=tracking.drift(RESTING, [0, 1])),
         "live.Frame": call(live.Frame, image=IMAGE, t_s=0.5),
         "live.MiddleThird": call(live.MiddleThird, of="h", channel=Channel(), to_channel=FILM.to_channel),
         "live.Monitor": call(
@@ -273,6 +291,7 @@ def played(**given):
 NOT_CALLED = {
     "gdptlab.Calibration": "made by its constructors, which are called",
     "datasets.planar_beads": "takes nothing",
+    "datasets.astigmatic_bead": "takes nothing",
     "gdptlab.versions": "takes nothing",
     "experiment.IMAGE_TYPES": "a tuple",
     "experiment.make_samples": "writes the samples of the repository",
@@ -302,7 +321,9 @@ def public_names(room):
     if hasattr(room, "__all__"):
         return room.__all__
     return [
-        name for name, value in vars(room).items() if inspect.isfunction(value) and value.__module__ == room.__name__
+        name
+        for name, value in vars(room).items()
+        if inspect.isfunction(value) and value.__module__ == room.__name__ and not name.startswith("_")
     ]
 
 

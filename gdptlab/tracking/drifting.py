@@ -31,7 +31,7 @@ def drift(tracks: pd.DataFrame, particles: ArrayLike) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        A row for each frame with one of them: `frame`; `x_um`, `y_um`, `z_um` (or `x_px`, `y_px`, `z_um`), the drift
+        A row for each frame with one of them: `frame`; columns of positions, as `x_um`, `y_um`, `z_um`, the drift
         since the first of these frames; `x_se_um` and so on, its standard error from how much the particles differ
         in the frame (not counting that of the first frame), NaN where there is only one; and `n`, how many there are.
 
