@@ -16,7 +16,7 @@ from gdptlab._plans import KEPT, planned
 from gdptlab.calibration import levelled
 from gdptlab.correlation import normalised
 from gdptlab.denoising import signal_to_noise
-from gdptlab.pipeline.calibration_file import VERSION
+from gdptlab.pipeline.calibration_file import LEARNED, VERSION
 
 CENTRE_PX = 0.1  # mean error of x and y with a calibration cut out of a scan
 CENTRE_Z_UM = 1.0  # likewise of z
@@ -554,11 +554,9 @@ def test_a_calibration_says_what_it_is(calibration) -> None:
 def learned_calibration(calibration):
     """A calibration that has learned four terms and two modes, as `from_scan(field=True, modes=2)` makes them."""
     model, rng = calibration.model, np.random.default_rng(12)
-    patterns = np.concatenate([model.patterns, 0.01 * rng.normal(size=(3, *model.patterns.shape[1:]))])
-    modes = 0.01 * rng.normal(size=(2, *model.patterns.shape[1:]))
-    learned = replace(
-        model, patterns=patterns.astype(np.float32), modes=modes.astype(np.float32), surface=np.arange(4.0)
-    )
+    changes, modes = (rng.normal(size=(n, *model.patterns.shape[1:])).astype(np.float32) for n in (3, 2))
+    patterns = np.concatenate([model.patterns, changes])
+    learned = replace(model, patterns=patterns, modes=modes, surface=np.arange(4.0))
     return replace(calibration, learned=learned)
 
 

@@ -101,9 +101,8 @@ def _sound_model(parts: dict[str, NDArray]) -> PatternModel:
     shapes = {"patterns": (terms, count, m, m), "pattern_error": (count, m, m), "own_error": (count, 3)}
     shapes |= {"z_um": (count,), "own_bias_um": (count,), "surface": (4,)}
     fits = all(parts[name].shape == shape for name, shape in shapes.items()) and modes.shape[1:] == (count, m, m)
-    if not (
-        fits and terms in (1, 4) and nodes in (1, 2) and m % (2 * nodes) == 1 and (np.diff(parts["z_um"]) > 0).all()
-    ):
+    known = terms in (1, 4) and nodes in (1, 2) and m % (2 * nodes) == 1
+    if not (fits and known and (np.diff(parts["z_um"]) > 0).all()):
         raise ValueError("its learned patterns do not fit each other")
     scalars = {"nodes_per_px": nodes, "size": int(parts["size"]), "noise": float(parts["noise"])}
     return PatternModel(**parts | scalars)
