@@ -10,9 +10,10 @@ import pandas as pd
 import pytest
 import tifffile
 
-from gdptlab.__main__ import BAD, main
+from gdptlab.__main__ import main
 from gdptlab.assessment import match
 from gdptlab.pipeline import measure
+from gdptlab.pipeline.command import BAD
 from gdptlab.pipeline.tables import in_um
 
 UM_PER_PX, RATE = 0.5, 20.0

@@ -25,7 +25,7 @@ from gdptlab._checks import rate as check_rate
 from gdptlab._checks import table as check_table
 from gdptlab.experiment.channel import IN_CHANNEL, Focusing
 from gdptlab.experiment.film import Film
-from gdptlab.tracking.tracks import frames_of, identify, must_be_tracks
+from gdptlab.tracking.tracks import frames_of, identify
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t. Convention of robust fits: at 5 standard deviations a residual weighs a sixth of
@@ -100,7 +100,6 @@ def fit_energy(
     """
     columns = ["frame", "particle", "y_channel_um", "y_std_um", "z_um", "z_std_um"]
     check_table("tracks", tracks, columns)
-    must_be_tracks(tracks)
     instance("focusing", focusing, Focusing)
     rate = check_rate("frame_rate_hz", frame_rate_hz)
     if not 0 < positive("confidence", confidence) < 1:
@@ -196,7 +195,7 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
     slices = pd.factorize(np.floor(tracks["z_um"].to_numpy() / SLICE_UM))[0]
     # Of tracks the jackknife: by how much the result would change without this one.
     fitted = _Rate(log_ratio, total(pull) / (stiffness.sum() - stiffness), np.bincount(slices, pull) / stiffness.sum())
-    if not _variance(fitted.tracks, fitted.slices) < 1:
+    if not 0 < _variance(fitted.tracks, fitted.slices) < 1:
         raise ValueError(f"tracks: got some that hardly move along {axis}, allowed are those that sound moves")
     return fitted
 
