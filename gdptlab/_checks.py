@@ -32,13 +32,22 @@ def number(name: str, value: Any) -> float:
     return float(value)
 
 
-def positive(name: str, value: Any, *, zero: bool = False) -> float:
-    """Return `value` as a float if it is a finite number above zero (or zero, if allowed)."""
+def positive(name: str, value: Any, *, zero: bool = False, infinite: bool = False) -> float:
+    """Return `value` as a float if it is a finite number above zero (or zero, or infinity, if allowed)."""
     allowed = "a finite number, at least 0" if zero else "a finite number above 0"
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name}: got {value!r}, allowed is {allowed}")
+    if infinite and value == math.inf:
+        return math.inf
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
         raise ValueError(f"{name}: got {value!r}, allowed is {allowed}")
+    return float(value)
+
+
+def rate(name: str, value: Any) -> float:
+    """Return `value` as a float if it is a number of frames in a second, 1e-9 to 1e9."""
+    if not 1e-9 <= positive(name, value) <= 1e9:
+        raise ValueError(f"{name}: got {value!r}, allowed is 1e-9 to 1e9")
     return float(value)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gdptlab._checks import generator, positive, real_array
+from gdptlab._checks import generator, positive, real_array, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +35,7 @@ class Camera:
         positive("read_noise", self.read_noise, zero=True)
         if self.electrons_per_count is not None:
             positive("electrons_per_count", self.electrons_per_count)
-        if self.bit_depth not in range(1, 17):
-            raise ValueError(f"bit_depth: got {self.bit_depth!r}, allowed are whole numbers from 1 to 16")
+        whole("bit_depth", self.bit_depth, 1, 16)
 
     def record(self, light: NDArray, rng: np.random.Generator | int | None = None) -> NDArray[np.uint16]:
         """Record light as a frame of counts.

@@ -28,6 +28,10 @@ wall and 3e-12 one particle radius off it; with 10 terms, 5e-4 and 6e-5. More te
 IN_CHANNEL = {"x": "x_channel_um", "y": "y_channel_um", "z": "z_um"}
 """Columns of a position in the channel, by axis."""
 
+FARTHEST_UM = 1e9
+"""Largest distance of a particle from the view, µm. Chosen: a kilometre, far beyond any channel; so far away positions
+have still seven digits after the point."""
+
 MOST_PARTICLES = 1e7
 """Largest number of particles that are drawn. Chosen: their paths take some gigabytes; the paper's film has 100."""
 
@@ -345,7 +349,7 @@ class Trajectories:
             raise ValueError(f"start: got columns {list(self.start.columns)}, allowed are {columns}")
         if self.start.empty:
             raise ValueError("start: got no particle, allowed is one or more")
-        _within("start x_channel_um", self.start["x_channel_um"], 1e9)
+        _within("start x_channel_um", self.start["x_channel_um"], FARTHEST_UM)
         for axis in "yz":
             _within(f"start {IN_CHANNEL[axis]}", self.start[IN_CHANNEL[axis]], self.focusing.free_um(axis))
         object.__setattr__(self, "start", self.start[columns].reset_index(drop=True))
@@ -391,6 +395,10 @@ class Trajectories:
         border, view = positive("border_um", border_um, zero=True), positive("view_length_um", view_length_um)
         density = positive("mean_in_view", mean_in_view) / view
         drift = focusing.channel.max_speed_um_s * positive("duration_s", duration_s)
+        if not view + 2 * border + drift < FARTHEST_UM:
+            raise ValueError(
+                f"duration_s: got a drift of {drift:g} µm to a view of {view:g}, allowed are {FARTHEST_UM:g}"
+            )
         if not density * (view + 2 * border + drift) < MOST_PARTICLES:
             raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed are {MOST_PARTICLES:g} particles in all")
         # Stretches from the downstream end: the view with its borders, then as many views as the drift needs.
@@ -453,7 +461,7 @@ class Trajectories:
         t = numbers("times_s", times_s, 0, self.duration_s)
         if t.ndim != 1:
             raise ValueError(f"times_s: got shape {t.shape}, allowed is one axis")
-        border = border_um if border_um == np.inf else positive("border_um", border_um, zero=True)
+        border = positive("border_um", border_um, zero=True, infinite=True)
         x = self.start["x_channel_um"].to_numpy() + self._drift(t)
         y, z = self._across(t)
         frame, row = np.nonzero((x >= -border) & (x <= self.view_length_um + border))

@@ -101,6 +101,7 @@ def disturbed(
     array (rows, columns)
     """
     rows, columns = real_array("light", light, 2).shape
+    light = np.asarray(light)
     phases = numbers("phase_rad", phase_rad)
     for name, two in (("period_px", period_px), ("phase_rad", phase_rad)):
         if np.shape(two) != (2,):

@@ -417,12 +417,12 @@ def expected_delay(tau_s: ArrayLike, camera_s: float = 0.04, truth_s: float | No
     DataFrame
         `tau_s`; `mean_s`, `low_s` and `high_s`: mean, smallest and largest delay of the frame's timestamp.
     """
-    tau = np.atleast_1d(numbers("tau_s", tau_s))
+    tau = _one_axis("tau_s", tau_s)
     for value in tau.tolist():
         positive("tau_s", value)
     d = positive("camera_s", camera_s)
     fine = d if truth_s is None else positive("truth_s", truth_s)
-    if abs(d / fine - round(d / fine)) > 1e-6 or round(d / fine) < 1:
+    if not fine * 1e9 > d or abs(d / fine - round(d / fine)) > 1e-6 or round(d / fine) < 1:
         raise ValueError(f"truth_s: got {fine:g}, allowed is a whole part of camera_s = {d:g}")
     full = np.floor(tau / d + 1e-9)  # steps of the staircase d floor(U / d) that are whole
     mean = d * (full * (full - 1) / 2 * d + full * np.maximum(tau - full * d, 0)) / tau
@@ -468,6 +468,8 @@ def errors(
     """
     whole("phases", phases, 1, 10_000)
     positive("limit_s", limit_s)
+    if tau_s is not None:
+        _one_axis("tau_s", tau_s)
     columns = ["frame", "t_s", "fraction_h", "fraction_w", "true_fraction_h", "true_fraction_w", "level"]
     check_table("table", table, [*columns, "true_h_s", "true_w_s"])
     if tau_s is None and "tau_s" not in table:
@@ -496,6 +498,14 @@ def errors(
                     rows.append((*key, mean, phase, trigger, *result, fired, ideal, ideal and off))
     columns = ["tau_s", "phase_s", "trigger", "true_s", "error_s", "delay_s", "own_error_s", "decision_error_s"]
     return pd.DataFrame(rows, columns=[*keys, *columns, "dropped", "fired", "possible", "failed"])
+
+
+def _one_axis(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Return a number, or numbers along one axis, as an array (n,)."""
+    array = np.atleast_1d(numbers(name, value))
+    if array.ndim > 1 or not array.size:
+        raise ValueError(f"{name}: got shape {array.shape}, allowed is a number, or one axis of one or more")
+    return array
 
 
 def _clock(times: NDArray, tau: float | NDArray, fraction: float) -> tuple:
@@ -528,11 +538,11 @@ def summary(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """
     by, rows = instances("by", by, str), []
     check_table("table", table, ["possible", "fired", "failed", "error_s", "own_error_s"])
-    if not by or set(by) - set(table):
+    if not by or {*by, "seed", "image_type"} - set(table):
         raise ValueError(f"by: got {by}, allowed are one or more columns of the table, {', '.join(table)}")
     for key, part in table.groupby(by, sort=False):
-        possible = part[part["possible"]]
-        fired = possible[possible["fired"]]
+        possible = part[part["possible"].astype(bool)]
+        fired = possible[possible["fired"].astype(bool)]
         row = dict(zip(by, key, strict=True)) | {
             "films": len(part[["seed", "image_type"]].drop_duplicates()),
             "replays": len(possible),

@@ -57,8 +57,7 @@ class Switched(Trajectories):
         if self.off_s is None:
             return super().table(times_s, border_um=border_um)
         t = numbers("times_s", times_s, 0, self.duration_s)
-        if border_um != np.inf:
-            positive("border_um", border_um, zero=True)
+        border_um = positive("border_um", border_um, zero=True, infinite=True)
         on_s = np.minimum(t, self.off_s)
         table = super().table(on_s, border_um=np.inf)
         drifting = (t - on_s)[table["frame"]]

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from threading import TIMEOUT_MAX, Condition, Event, Lock, Thread, current_thread
+from threading import Condition, Event, Lock, Thread, current_thread
 from time import perf_counter, sleep
 from typing import Any, Self
 
@@ -27,7 +27,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, function, instance, instances, iterable, number, positive, real_array, whole
+from gdptlab._checks import choice, function, instance, instances, iterable, number, positive, rate, real_array, whole
 from gdptlab._checks import path as check_path
 from gdptlab.experiment.channel import Channel
 from gdptlab.experiment.trigger import in_middle_third
@@ -84,9 +84,7 @@ def at_speed(frames: Iterable[ArrayLike], rate_hz: float) -> Iterator[ArrayLike]
         If the rate is not a number above 0.
     """
     iterable("frames", frames)
-    period_s = 1 / positive("rate_hz", rate_hz)
-    if period_s > TIMEOUT_MAX:
-        raise ValueError(f"rate_hz: got {rate_hz}, allowed is {1 / TIMEOUT_MAX:.0e} or more")
+    period_s = 1 / rate("rate_hz", rate_hz)
 
     def paced() -> Iterator[ArrayLike]:
         """Sleep until the time of each frame (the check of the rate must not wait for the first)."""

@@ -110,8 +110,8 @@ def _centres(scan: NDArray, z_um: NDArray, x_px: float, y_px: float, size: int) 
     cut = levelled(cut_out(scan, x_px, y_px, size // 2).astype(np.float32))
     smooth = denoised(cut)
     weight = np.einsum("kij,kij->k", smooth, smooth)  # of the particle, not of the noise
-    if not weight.all():
-        blank = np.flatnonzero(weight == 0).tolist()
+    blank = np.flatnonzero((weight == 0) | ~cut.any(axis=(1, 2))).tolist()
+    if blank:
         raise ValueError(f"scan: got frames without contrast around x_px, y_px at {blank}, allowed are frames with it")
     shifts = [
         # Half a turn about the middle moves an image that is symmetric about c by -2 c.

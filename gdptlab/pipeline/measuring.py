@@ -256,7 +256,7 @@ def _opened_scan(scan: str | os.PathLike[str], z_um: tuple[float, float] | None)
     """Images of a scan (N, rows, columns) and their depths (N,), by increasing depth."""
     if z_um is None:
         return open_scan(scan)
-    if not isinstance(z_um, Sequence | np.ndarray) or len(z_um) != 2:
+    if not isinstance(z_um, Sequence | np.ndarray) or np.shape(z_um) != (2,):
         raise TypeError(f"z_um: got {z_um!r}, allowed are two numbers: the first and the last depth")
     z_um = tuple(number("z_um", float(z) if isinstance(z, np.generic) else z) for z in z_um)
     images = open_images(scan)

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab._checks import positive
+from gdptlab._checks import LARGEST, positive
 from gdptlab.calibration import Calibration, checked
 from gdptlab.denoising import noise_level, signal_to_noise
 from gdptlab.fit.bounds import expected_error
@@ -85,7 +85,7 @@ def depth_quality(calibration: Calibration, noise: float | None = None) -> pd.Da
     none = other < 0
     each = np.arange(len(calibration))
     own_noise = max(noise_level(calibration.stack), 1e-9)
-    noise = own_noise if noise is None else positive("noise", noise)
+    noise = own_noise if noise is None else float(np.clip(positive("noise", noise), 1 / LARGEST, LARGEST))
     following = np.append(np.diagonal(correlation, 1), correlation[-1, -2])
     return pd.DataFrame(
         {

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial import KDTree
 
-from gdptlab._checks import generator, instance, instances, positive
+from gdptlab._checks import LARGEST, generator, instance, instances, positive
+from gdptlab._checks import rate as check_rate
 from gdptlab._checks import table as check_table
 from gdptlab.experiment.channel import IN_CHANNEL, Focusing
 from gdptlab.experiment.film import Film
@@ -100,11 +101,12 @@ def fit_energy(
     columns = ["frame", "particle", "y_channel_um", "y_std_um", "z_um", "z_std_um"]
     check_table("tracks", tracks, columns)
     instance("focusing", focusing, Focusing)
-    rate = positive("frame_rate_hz", frame_rate_hz)
+    rate = check_rate("frame_rate_hz", frame_rate_hz)
     if not 0 < positive("confidence", confidence) < 1:
         raise ValueError(f"confidence: got {confidence}, allowed is between 0 and 1")
-    if not (np.isfinite(tracks[columns]).all(axis=None) and (tracks[["y_std_um", "z_std_um"]] > 0).all(axis=None)):
-        raise ValueError("tracks: got NaN, or a standard deviation of 0, allowed are finite numbers and above 0")
+    stds = tracks[["y_std_um", "z_std_um"]]
+    if not ((tracks[columns].abs() <= LARGEST).all(axis=None) and (stds >= 1 / LARGEST).all(axis=None)):
+        raise ValueError(f"tracks: got NaN, numbers beyond {LARGEST:g}, or a standard deviation of 0, allowed are none")
     tracks = tracks[tracks.groupby("particle")["frame"].transform("size") > 1]
     number = tracks["particle"].nunique()
     if number < 3:
@@ -179,6 +181,8 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
         alone = by_log - (total(weight * by_middle * by_log) / own)[track] * by_middle  # what no `middle` can do
         pull = weight * alone * (position - path)
         information = (weight * alone**2).sum()
+        if not information > 0:
+            raise ValueError(f"tracks: got some that do not move along {axis}, allowed are those that sound moves")
         step = float(np.clip(pull.sum() / information, -LONGEST_STEP, LONGEST_STEP))
         log_ratio += step
         middle = middle + total(weight * by_middle * (position - path - by_log * step)) / own
@@ -191,7 +195,7 @@ def _fit(tracks: pd.DataFrame, focusing: Focusing, axis: str, frame_rate_hz: flo
     slices = pd.factorize(np.floor(tracks["z_um"].to_numpy() / SLICE_UM))[0]
     # Of tracks the jackknife: by how much the result would change without this one.
     fitted = _Rate(log_ratio, total(pull) / (stiffness.sum() - stiffness), np.bincount(slices, pull) / stiffness.sum())
-    if not _variance(fitted.tracks, fitted.slices) < 1:
+    if not 0 < _variance(fitted.tracks, fitted.slices) < 1:
         raise ValueError(f"tracks: got some that hardly move along {axis}, allowed are those that sound moves")
     return fitted
 

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab._checks import flag, positive
+from gdptlab._checks import flag
 from gdptlab._checks import path as check_path
+from gdptlab._checks import rate as check_rate
 from gdptlab._checks import table as check_table
 from gdptlab._files import written_whole
 from gdptlab.tracking.tracks import IN_CHANNEL, IN_UM, frames_of, positions_of
@@ -39,7 +40,7 @@ def save_paraview_tracks(tracks: pd.DataFrame, path: str | os.PathLike[str], fra
     FileNotFoundError
         If there is no such folder.
     """
-    path, rate = _path(path, ".pvd"), positive("frame_rate_hz", frame_rate_hz)
+    path, rate = _path(path, ".pvd"), check_rate("frame_rate_hz", frame_rate_hz)
     frames_of("tracks", tracks)
     position = _position_um(tracks)
     root, collection = _vtk_file("Collection")
@@ -156,9 +157,9 @@ def _vtk_file(kind: str, **attributes: str) -> tuple[Element, Element]:
 
 def _add_values(parent: Element, table: pd.DataFrame) -> None:
     """Add each column of numbers as an array (n,), and those of a velocity as a vector (n, 3), too."""
+    table = table[[name for name in table if table[name].dtype.kind in "buif"]]
     for name in table:
-        if table[name].dtype.kind in "buif":
-            _add_array(parent, str(name), table[name].to_numpy(dtype=float))
+        _add_array(parent, str(name), table[name].to_numpy(dtype=float))
     velocity = [f"v{axis}_um_s" for axis in "xyz"]
     if set(velocity) & set(table):
         _add_array(parent, "velocity", table.reindex(columns=velocity, fill_value=0.0).to_numpy(dtype=float))

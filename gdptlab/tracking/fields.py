@@ -8,7 +8,8 @@ import pandas as pd
 import trackpy
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import positive, real_array, whole
+from gdptlab._checks import iterable, real_array, whole
+from gdptlab._checks import rate as check_rate
 from gdptlab._checks import table as check_table
 from gdptlab.tracking.tracks import must_be_tracks, positions_of
 
@@ -48,9 +49,9 @@ def mean_field(
     check_table("table", table, ())
     if values is None:
         values = [name for name in (f"v{a}_{unit}_s" for a in "xyz" for unit in ("um", "px")) if name in table]
-    if isinstance(values, str) or not isinstance(values, Iterable):
+    if isinstance(values, str):
         raise TypeError(f"values: got {values!r}, allowed is a list of columns")
-    values = list(values)
+    values = list(iterable("values", values))
     if not values:
         raise ValueError("values: got none, and table has no velocities, needed is a column or more")
     if set(cells) & set(values):
@@ -139,7 +140,7 @@ def mean_squared_displacement(tracks: pd.DataFrame, frame_rate_hz: float, *, lon
         If an argument is not of that form, a column is missing, or no track has two rows.
     """
     must_be_tracks(tracks)
-    columns, rate = positions_of("tracks", tracks), positive("frame_rate_hz", frame_rate_hz)
+    columns, rate = positions_of("tracks", tracks), check_rate("frame_rate_hz", frame_rate_hz)
     if not tracks.duplicated("particle").any():
         raise ValueError("tracks: got none of two or more rows, needed is one")
     floats, most = tracks.astype(dict.fromkeys(columns, float)), whole("longest", longest, 1, 10**6)

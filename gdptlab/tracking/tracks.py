@@ -17,7 +17,7 @@ import trackpy
 from numpy.typing import ArrayLike, NDArray
 from trackpy.predict import NearestVelocityPredict
 
-from gdptlab._checks import LARGEST, positive, whole
+from gdptlab._checks import LARGEST, rate, whole
 from gdptlab._checks import table as check_table
 from gdptlab.assessment import match
 
@@ -145,7 +145,7 @@ def link(
     whole("memory", memory, 0, 10_000)
     whole("min_rows", min_rows, 1, 2**31)
     if isinstance(predictor, Flow):
-        positive("frame_rate_hz", frame_rate_hz)
+        rate("frame_rate_hz", frame_rate_hz)
         check_table("table", table, IN_CHANNEL)
     elif predictor is not None and not (isinstance(predictor, str) and predictor == "nearest velocity"):
         raise TypeError(f"predictor: got {predictor!r}, allowed are None, 'nearest velocity' and a Channel")
@@ -257,7 +257,7 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float | None = None, *, wind
     if weighted and not (check_table("tracks", tracks, stds)[stds] > 0).all(axis=None):
         raise ValueError("tracks: got a standard deviation that is NaN or not above 0, allowed are those above 0")
     if frame_rate_hz is not None:
-        t_s = tracks["frame"].to_numpy() / positive("frame_rate_hz", frame_rate_hz)
+        t_s = tracks["frame"].to_numpy() / rate("frame_rate_hz", frame_rate_hz)
     elif "t_s" in tracks:
         t_s = check_table("tracks", tracks, ["t_s"])["t_s"].to_numpy(dtype=float)
     else:
@@ -340,6 +340,8 @@ def identify(
     """
     check_table("tracks", tracks, ["frame", "x_px", "y_px", "z_um"])
     check_table("true", true, ["frame", "particle", "x_px", "y_px", "z_um"])
+    if len(true) and true["particle"].dtype.kind not in "iu":
+        raise TypeError(f"true: got particles of type {true['particle'].dtype}, allowed are whole numbers")
     tracks, true = tracks.reset_index(drop=True), true.reset_index(drop=True)
     pair = match(tracks, true, within_px=within_px, within_um=within_um)
     who = np.full(len(tracks), -1)
