@@ -388,12 +388,7 @@ def folder(tmp_path_factory):
 
 
 UNNAMED = {
-    "fit.explained": "before",
     "fit.learned": "some of its arrays",
-    "fit.own_bias_um": "calibration",
-    "fit.own_error": "calibration",
-    "fit.expected_error": "calibration",
-    "fit.particle_light": "calibration",
     "fit.decided_by_plane": "table",
     "fit.field_terms": "x_px and y_px that do not fit",
 }

@@ -3,6 +3,7 @@
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from gdptlab._checks import instance
 from gdptlab._compiled import on_one_core
 from gdptlab._plans import planned
 from gdptlab.calibration import Calibration
@@ -29,9 +30,16 @@ def explained(
         As from `Joint.table`.
     explained : Explained
         Where the next frame begins.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not of that form.
     """
     image = checked_image(image, calibration)
     joint = planned(calibration, _joint, image.shape)
+    if before is not None:
+        instance("before", before, Explained)
     if before is None or before.fit.residual.shape != image.shape:
         found = joint.first(image)
     else:

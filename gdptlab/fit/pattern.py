@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import median, median_filter
 
-from gdptlab.calibration import Calibration, levelled
+from gdptlab.calibration import Calibration, checked, levelled
 from gdptlab.denoising import denoised, noise_level
 
 RIM = 0.06
@@ -33,8 +33,13 @@ def particle_light(calibration: Calibration) -> NDArray[np.float32]:
     -------
     float32 array (N, n, n)
         Below 0 for dark particles.
+
+    Raises
+    ------
+    TypeError
+        If it is no calibration.
     """
-    stack, z_um = calibration.stack, calibration.z_um
+    stack, z_um = checked(calibration).stack, calibration.z_um
     strength = np.einsum("kij,kij->k", levelled(stack), calibration.templates)
     smooth = _smooth_in_z(z_um, strength[:, None])[:, 0, None, None] * calibration.templates
     tilt = _smooth_planes(z_um, stack - levelled(stack))
