@@ -308,14 +308,14 @@ class Joint:
         places = search.places * (self._scale, self._scale, 1, 1)
         return np.pad(places, ((0, 0), (0, self.model.modes_count))), search.population or UNKNOWN, search.surface or 0
 
-    @staticmethod
-    def _foreign(explained: Explained) -> NDArray[np.bool_]:
+    def _foreign(self, explained: Explained) -> NDArray[np.bool_]:
         """Which of a fit's particles no pattern explains: debris, dust."""
         amplitude, population = explained.fit.places[:, 3], explained.population
         unsure = explained.fit.amplitude_std / amplitude
         unusual = np.abs(np.log(amplitude / population.centre)) / np.hypot(max(population.sigma, LEAST_SIGMA), unsure)
         chi2, sigmas = FOREIGN_UNUSUAL
-        return (explained.excess > FOREIGN) | (explained.excess > chi2) & (unusual > sigmas)
+        suspect = (explained.excess > FOREIGN) | (explained.excess > chi2) & (unusual > sigmas)
+        return suspect & self._full.worst(explained.fit.places, explained.excess)
 
     def table(self, explained: Explained, *, foreign: bool = False) -> pd.DataFrame:
         """What is in a frame.

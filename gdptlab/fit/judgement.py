@@ -88,10 +88,12 @@ class Level:
 
     def odd(self, places: NDArray[np.float64], excess: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which particles (P,) have a residual that is more than noise, and more than their neighbours'."""
-        excess = excess / max(np.median(excess), 1e-12)
+        return (excess > ODD * max(np.median(excess), 1e-12)) & self.worst(places, excess)
+
+    def worst(self, places: NDArray[np.float64], excess: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which particles (P,) are no mere neighbours of one whose residual is far worse."""
         distance = np.hypot(*(places[:, None, :2] - places[:, :2]).T)
-        worst = np.where(distance < self.size / 2, excess, 0).max(axis=1)
-        return (excess > ODD) & (excess > WORST * worst)
+        return excess > WORST * np.where(distance < self.size / 2, excess, 0).max(axis=1, initial=0)
 
     def merged(self, places: NDArray[np.float64], excess: NDArray[np.float64]) -> NDArray[np.float64]:
         """Particles (P, 4 + K), those merged that stand for one: too near to converge, their residual more than noise.
