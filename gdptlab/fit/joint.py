@@ -185,14 +185,16 @@ class Joint:
             new = self._unexplained(fit, weight, total, population) if again < 2 else places[:0]
             variance = learned_variance(fit.image, fit.residual, 1.0)
             weight = variance.weight(fit.image, pixels.valid)
-            if again == 0:
-                flat = self.reduced(frame - fit.image)
-                chosen = suitable(self._small_backgrounds, flat, self.reduced(weight), self._blur, CLEARLY_FINER)
-                surface, background = chosen, background if chosen == surface else None
+            if again == 0 and (suits := self._suits(frame - fit.image, weight)) != surface:
+                surface, background = suits, None
             likelier = self._likelier(fit, variance, pixels)[stays]
             places = np.concatenate([self._full.merged(likelier, excess[stays]), new])
         velocity = np.zeros((len(fit.places), 3))
         return Explained(fit, stays, fit.places, velocity, population, surface, variance, pixels, gain, excess)
+
+    def _suits(self, light: NDArray[np.float32], weight: NDArray[np.float32]) -> int:
+        """Which of the backgrounds suits a frame from which its particles were taken."""
+        return suitable(self._small_backgrounds, self.reduced(light), self.reduced(weight), self._blur, CLEARLY_FINER)
 
     def following(self, frame: NDArray[np.float32], before: Explained) -> Explained:
         """Explain the frame after one that is explained. A particle that appears in it is in the table of the next."""
