@@ -120,14 +120,7 @@ def pair(name: str, value: Any) -> tuple[int, int]:
 
 def numbers(name: str, value: ArrayLike, low: float = -LARGEST, high: float = LARGEST) -> NDArray[np.float64]:
     """Return `value` as a float64 array of its shape if all of it are numbers from `low` to `high`."""
-    _refuse_masked(name, value)
-    try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise ValueError(f"{name}: got what is no array ({error}), allowed are real numbers") from error
-    if array.dtype.kind not in "buif":
-        raise TypeError(f"{name}: got values of type {array.dtype}, allowed are real numbers")
-    array = array.astype(np.float64)
+    array = _real(name, value).astype(np.float64)
     outside = ~((array >= low) & (array <= high))  # in this form NaN is outside
     if outside.any():
         raise ValueError(f"{name}: got {array[outside].flat[0]}, allowed is {low:g} to {high:g}")
@@ -184,13 +177,7 @@ def positions(name: str, value: Any, columns: Iterable[str]) -> pd.DataFrame:
 
 def real_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
     """Return `value` as a finite float32 array of `ndim` axes, none of them empty; masked entries are refused."""
-    _refuse_masked(name, value)
-    try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise ValueError(f"{name}: got what is no array ({error}), allowed are {ndim} axes of real numbers") from error
-    if array.dtype.kind not in "buif":
-        raise TypeError(f"{name}: got values of type {array.dtype}, allowed are real numbers")
+    array = _real(name, value)
     if array.ndim != ndim or 0 in array.shape:
         colour = array.shape[ndim:] in ((3,), (4,))
         advice = f"; for a colour image take one channel, as in {name}[..., 1]" if colour else ""
@@ -225,6 +212,18 @@ def image_array(name: str, value: Any, ndim: int) -> NDArray[np.float32]:
     exact = np.asarray(value)
     offset = exact.flat[0] if exact.dtype.kind in "iu" else exact.mean(dtype=np.float64)
     return np.ascontiguousarray(np.subtract(exact, offset, dtype=np.float64), dtype=np.float32)
+
+
+def _real(name: str, value: Any) -> NDArray:
+    """Return `value` as an array of real numbers without masked entries."""
+    _refuse_masked(name, value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name}: got what is no array ({error}), allowed are real numbers") from error
+    if array.dtype.kind not in "buif":
+        raise TypeError(f"{name}: got values of type {array.dtype}, allowed are real numbers")
+    return array
 
 
 def _refuse_masked(name: str, value: Any) -> None:

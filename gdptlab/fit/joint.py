@@ -2,9 +2,10 @@
 
 Particles are found, some at a time, by a matched filter in what the others leave, and after each time all are fitted
 together. While much is unexplained, frame and patterns are high-pass filtered: neighbours not found yet are smooth
-there, and do not pull. A particle stays while it adds to the likelihood beside the others; where the residual is more
-than noise, particles are taken out and sought once more. In a film the particles of one frame, moved on, are where
-the next begins.
+there, and do not pull. What is too bright for one particle may be two: what its amplitude has above the population's
+stays in the residual that is searched. A particle stays while it adds to the likelihood beside the others; where the
+residual is more than noise, particles are taken out and sought once more, or two that are too near are made one. In a
+film the particles of one frame, moved on, are where the next begins.
 """
 
 from dataclasses import dataclass
@@ -178,8 +179,8 @@ class Joint:
             gain = self._full.gain(fit, weight, total)
             stays = self._full.staying(gain, fit.places, LEAST_GAIN)
             excess = self._full.excess(fit, weight, total)
-            merged = self._full.merged(fit.places[stays], excess[stays])
-            if again and len(merged) == len(fit.places):
+            settled = stays.all() and len(self._full.merged(fit.places, excess)) == len(fit.places)
+            if again and settled:
                 break
             population, background = learned_population(fit, stays, population), fit.background
             new = self._unexplained(fit, weight, total, population) if again < 2 else places[:0]
