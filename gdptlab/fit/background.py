@@ -24,7 +24,7 @@ class Background:
 
     def __init__(self, shape: tuple[int, int], knot_px: float) -> None:
         self._along = [_splines(n, max(round(n / knot_px), 1)) for n in shape]
-        self._pairs = [(b[:, :, None] * b[:, None, :]).reshape(len(b), -1) for b in self._along]
+        self._pairs, self._where = zip(*(_products_of(b) for b in self._along), strict=True)
 
     def fit(self, frame: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
         """Fit a frame from which the particles were taken.
@@ -55,8 +55,9 @@ class Background:
     def matrix(self, weight: NDArray[np.float32]) -> NDArray[np.float64]:
         """Matrix (B, B) of weighted least squares."""
         m, n = (along.shape[1] for along in self._along)
-        matrix = (self._pairs[0].T @ weight @ self._pairs[1]).reshape(m, m, n, n).transpose(0, 2, 1, 3)
-        matrix = matrix.reshape(m * n, m * n).astype(np.float64)
+        products = np.pad(self._pairs[0].T @ weight @ self._pairs[1], (0, 1))
+        down, across = self._where
+        matrix = products[down[:, None, :, None], across[None, :, None, :]].reshape(m * n, m * n).astype(np.float64)
         # Where the frame says nothing the surface stays small (in `fit`, near the median).
         matrix[np.diag_indices(m * n)] += 1e-6 * np.trace(matrix) / (m * n)
         return matrix
@@ -126,6 +127,15 @@ def suitable(
         smooth = cv2.GaussianBlur(residual - surface.fit(residual, weight), (0, 0), smooth_px)
         left.append(np.median(np.abs(smooth[weight > 0])))
     return int(np.argmax(np.array(left) <= finer * left[-1]))
+
+
+def _products_of(splines: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Products (n, Q) of splines (n, B) that overlap, and where each pair's stands among them, (B, B); else Q."""
+    count = splines.shape[1]
+    first, second = np.nonzero(np.triu(np.ones((count, count))) - np.triu(np.ones((count, count)), 4))
+    where = np.full((count, count), len(first))
+    where[first, second] = where[second, first] = np.arange(len(first))
+    return splines[:, first] * splines[:, second], where
 
 
 def _splines(n: int, spans: int) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ LONGEST = np.array([1.0, 1.0, 3.0, 0.5])
 """Longest step of y, x (px), slice and amplitude (as a fraction) of a particle fitted alone."""
 
 CLIMB = 4
-"""Steps of such a fit."""
+"""Steps from another depth before the modes are free."""
 
 APART = 3.0
 """Slices: depths nearer than this are one."""
@@ -63,45 +63,68 @@ class Alone:
         self._renderer, self._fit, self._variance, self._valid = renderer, fit, variance, valid
 
     def climbed(self, trials: NDArray[np.float64], owner: NDArray[np.int64], steps: int = CLIMB) -> Trials:
-        """Fit from `trials` (n, 4 + K), each in the stead of the particle `owner` (n,)."""
-        population = self._fit.population
+        """Fit from `trials` (n, 4 + K), each in the stead of the particle `owner` (n,).
+
+        The modes, in which the image is linear, are free in the last step only, whose gain is the one that the
+        quadratic approximation promises.
+        """
         for _ in range(steps):
-            matrix, right, _ = self._evaluated(trials, owner)
-            matrix[:, 3, 3] += population.precision(trials[:, 3])
-            right[:, 3] += population.pull(trials[:, 3])
-            change = np.linalg.solve(matrix, right[..., None])[..., 0]
-            scale = np.ones((len(trials), 4))
-            scale[:, 3] = trials[:, 3]
-            change /= np.maximum((np.abs(change[:, :4]) / (LONGEST * scale)).max(axis=1, keepdims=True), 1)
-            trials = trials + change
-            trials[:, 2] = np.clip(trials[:, 2], 0, self._renderer.count - 1)
-            trials[:, 3] = np.maximum(trials[:, 3], FAINTEST * population.centre)
-        matrix, _, gain = self._evaluated(trials, owner)
-        return Trials(trials, gain - population.penalty(trials[:, 3]), matrix)
+            trials, *_ = self._stepped(trials, owner, by_mode=False)
+        trials, gain, matrix = self._stepped(trials, owner, by_mode=True)
+        return Trials(trials, gain, matrix)
+
+    def _stepped(
+        self, trials: NDArray[np.float64], owner: NDArray[np.int64], *, by_mode: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Trials after a Gauss-Newton step, the gain (n,) that is expected there, and the matrix (n, C, C) before."""
+        population = self._fit.population
+        evidence, right, gain = self._evaluated(trials, owner, by_mode=by_mode)
+        gain -= population.penalty(trials[:, 3])
+        matrix = evidence.copy()
+        matrix[:, 3, 3] += population.precision(trials[:, 3])
+        right[:, 3] += population.pull(trials[:, 3])
+        change = np.linalg.solve(matrix, right[..., None])[..., 0]
+        scale = np.ones((len(trials), 4))
+        scale[:, 3] = trials[:, 3]
+        part = 1 / np.maximum((np.abs(change[:, :4]) / (LONGEST * scale)).max(axis=1), 1)
+        gain += (part - part**2 / 2) * (right * change).sum(axis=1)
+        trials = trials.copy()
+        trials[:, :change.shape[1]] += part[:, None] * change
+        trials[:, 2] = np.clip(trials[:, 2], 0, self._renderer.count - 1)
+        trials[:, 3] = np.maximum(trials[:, 3], FAINTEST * population.centre)
+        return trials, gain, evidence
 
     def best(self, slices: NDArray[np.float64]) -> Trials:
-        """The best fit of each particle at other depths: starts at `slices` (P, S), NaN: none.
+        """The best fit of each particle at another depth: starts at `slices` (P, S), NaN: none.
 
-        A particle that climbs back to its own depth has no other; its gain is minus infinity.
+        The start that promises most is climbed from. A particle that climbs back to its own depth has no other; its
+        gain is minus infinity.
         """
         places = self._fit.places
+        out = Trials(places.copy(), np.full(len(places), -np.inf), np.zeros((len(places), *2 * (places.shape[1],))))
         owner, start = np.nonzero(np.isfinite(slices))
+        if not len(owner):
+            return out
         trials = places[owner]
         trials[:, 2] = slices[owner, start]
-        trials = self.climbed(trials, owner)
-        gain = np.where(np.abs(trials.places[:, 2] - places[owner, 2]) < APART, -np.inf, trials.gain)
-        out = Trials(places.copy(), np.full(len(places), -np.inf), np.zeros((len(places), *trials.matrix.shape[1:])))
-        order = np.argsort(gain, kind="stable")  # the best of each particle comes last, and stays
-        for name in ("places", "matrix"):
-            getattr(out, name)[owner[order]] = getattr(trials, name)[order]
-        out.gain[owner[order]] = gain[order]
+        matrix, right, gain = self._evaluated(trials, owner, by_mode=False)
+        promise = gain + right[:, 3] ** 2 / (2 * matrix[:, 3, 3])  # with the amplitude that suits the start
+        order = np.lexsort((-promise, owner))
+        first = order[np.unique(owner[order], return_index=True)[1]]
+        own = owner[first]
+        climbed = self.climbed(trials[first], own)
+        out.places[own], out.matrix[own] = climbed.places, climbed.matrix
+        out.gain[own] = np.where(np.abs(climbed.places[:, 2] - places[own, 2]) < APART, -np.inf, climbed.gain)
         return out
 
     def _evaluated(
-        self, trials: NDArray[np.float64], owner: NDArray[np.int64]
+        self, trials: NDArray[np.float64], owner: NDArray[np.int64], *, by_mode: bool = True
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Matrix (n, C, C), right-hand side (n, C) and gain in log-likelihood (n,) at `trials`."""
-        fit, size = self._fit, trials.shape[1]
+        """Matrix (n, C, C), right-hand side (n, C) and gain in log-likelihood (n,) at `trials`.
+
+        C is the number of unknown: 4, and those of the modes if they are free (`by_mode`).
+        """
+        fit, size = self._fit, trials.shape[1] if by_mode else 4
         columns = self._renderer.draw(trials, fit.frame.shape, by_mode=size > 4)
         upper, diagonal = np.triu_indices(size), np.arange(size)
         sums = np.zeros((len(trials), len(upper[0]) + size + 1))
@@ -117,7 +140,7 @@ class Alone:
         matrix[:, diagonal, diagonal] = 1.01 * matrix[:, diagonal, diagonal] + 1e-9
         matrix[:, diagonal[4:], diagonal[4:]] += 1
         right = sums[:, len(upper[0]) : -1]
-        right[:, 4:] -= trials[:, 4:]
+        right[:, 4:] -= trials[:, 4:size]
         return matrix, right, sums[:, -1] - (trials[:, 4:] ** 2).sum(axis=1) / 2
 
 

@@ -188,8 +188,8 @@ class Joint:
             weight = variance.weight(fit.image, pixels.valid)
             if again == 0 and (suits := self._suits(frame - fit.image, weight)) != surface:
                 surface, background = suits, None
-            likelier = self._likelier(fit, variance, pixels)[stays]
-            places = np.concatenate([self._full.merged(likelier, excess[stays]), new])
+            likelier = self._likelier(fit, variance, pixels) if again < 2 else fit.places
+            places = np.concatenate([self._full.merged(likelier[stays], excess[stays]), new])
         velocity = np.zeros((len(fit.places), 3))
         return Explained(fit, stays, fit.places, velocity, population, surface, variance, pixels, gain, excess)
 
@@ -235,7 +235,7 @@ class Joint:
     def _alone(self, fit: Fit, variance: Variance, pixels: Pixels) -> tuple[Trials, Trials]:
         """Each particle of a fit alone, its modes free: from where it is, and on the other side of focus."""
         alone = Alone(self._full.renderer, fit, variance, pixels.valid)
-        own = alone.climbed(fit.places, np.arange(len(fit.places)))
+        own = alone.climbed(fit.places, np.arange(len(fit.places)), 0)
         height = field_terms(fit.places[:, 1], fit.places[:, 0], self.shape) @ self.model.surface
         twin = np.interp(fit.places[:, 2] - height, np.arange(self.model.count), self.model.twin) + height
         return own, alone.best(np.clip(twin[:, None] + ASTRAY, 0, self.model.count - 1))

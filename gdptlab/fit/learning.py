@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve
-from scipy.ndimage import gaussian_filter, shift, uniform_filter1d
+from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.spatial import KDTree
 from scipy.stats import median_abs_deviation
 from skimage.registration import phase_cross_correlation
@@ -203,6 +203,7 @@ class _Learning:
         self.noise = max(noise_level(scan[:: max(len(scan) // 10, 1)]), 1e-4 * float(np.ptp(scan))) or 1.0
         self.line, self.believed = np.array([0, self.noise**2]), BELIEVED
         self.levels = np.median(scan[:, ::4, ::4], axis=(1, 2))
+        self._work = np.empty((3, *scan.shape), np.float32)
 
     def begin(self, terms: int) -> None:
         """First amplitudes and heights, from the particles' small surroundings, and empty patterns."""
@@ -225,6 +226,7 @@ class _Learning:
         m = 2 * self.fine * self.half + 1
         self.patterns = np.zeros((terms, len(self.scan), m, m), np.float32)
         self.modes = np.zeros((0, len(self.scan), m, m), np.float32)
+        self._prepare()
 
     def _cut(self, images: NDArray, i: int, half: int) -> NDArray:
         """Part of images (N, rows, columns) about particle i."""
@@ -240,17 +242,18 @@ class _Learning:
         smooth = self.terms @ surface
         self.heights = np.clip(self.heights, smooth - self.believed, smooth + self.believed)
 
-    def _renderer(self) -> Renderer:
+    def _prepare(self) -> None:
+        """Prepare the drawing of the patterns and modes as they are."""
         modes = self.modes if len(self.modes) else None
-        return Renderer(self.patterns, self.fine, noise=self.noise, surface=self.surface, modes=modes)
+        self._renderer = Renderer(self.patterns, self.fine, noise=self.noise, modes=modes)
 
     def _slice(
-        self, renderer: Renderer, k: int, *, by_mode: bool = False
+        self, k: int, *, derivatives: bool = True, by_mode: bool = False
     ) -> tuple[Columns, NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Columns of the particles in a slice, the residual, the pixels' weight, and the model image."""
         places = self.places.copy()
         places[:, 2] = k
-        columns = renderer.draw(places, self.shape, self.heights, by_mode=by_mode)
+        columns = self._renderer.draw(places, self.shape, self.heights, derivatives=derivatives, by_mode=by_mode)
         light = np.zeros(self.shape, np.float32)
         columns.add_to(light, places[:, 3])
         weight = self._weight(light + self.levels[k], light)
@@ -265,11 +268,10 @@ class _Learning:
         return 1 / (variance + np.square(np.float32(MISFIT) * light))
 
     def _residual(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Residual of all slices and its weight; what there is of photon noise is learned on the way."""
-        renderer, rest, weight = self._renderer(), np.empty_like(self.scan), np.empty_like(self.scan)
-        model = np.empty_like(self.scan)
+        """Residual of all slices and its weight, until the next call; photon noise is learned on the way."""
+        rest, weight, model = self._work
         for k in range(len(self.scan)):
-            _, rest[k], weight[k], model[k] = self._slice(renderer, k)
+            _, rest[k], weight[k], model[k] = self._slice(k, derivatives=False)
         if self.patterns.any():
             some = slice(None, None, max(len(rest) // NOISE_SLICES, 1))
             self.line = noise_line(rest[some], model[some])
@@ -302,6 +304,7 @@ class _Learning:
         if symmetric:
             self.patterns[0] = (self.patterns[0] + self.patterns[0, :, ::-1, ::-1]) / 2
         self._settle()
+        self._prepare()
 
     def _settle(self) -> None:
         """Give back to positions and heights what the patterns' changes over the field, and the modes, took from them.
@@ -320,7 +323,8 @@ class _Learning:
                 self.heights += shift_
                 continue
             told = np.array([np.vdot(slope, mode) / power for mode in self.modes])
-            self.modes -= told.astype(np.float32)[:, None, None, None] * slope
+            differ = np.any(self.modes, axis=(0, 2, 3))
+            self.modes[:, differ] -= told.astype(np.float32)[:, None, None, None] * slope[differ]
             self.places[:, of] += shift_ + self.places[:, 4:] @ told
 
     def _regressed(
@@ -363,17 +367,19 @@ class _Learning:
         ]
         # Half a turn about the middle moves an image that is symmetric about c by -2 c.
         off = np.average(off, axis=0, weights=light[order] ** 2)
-        self.patterns = shift(self.patterns, (0, 0, -off[0], -off[1]), order=3, mode="nearest")
+        flat = self.patterns.reshape(-1, *self.patterns.shape[2:])
+        self.patterns = np.stack([_shifted(pattern, -off) for pattern in flat]).reshape(self.patterns.shape)
         self.places[:, :2] += off / self.fine
+        self._prepare()
 
     # ---------------- particles
 
     def learn_places(self) -> None:
         """A Gauss-Newton step of all particles' y, x, height and amplitude, each the same in all slices."""
-        renderer, n = self._renderer(), 4 * len(self.places)
+        n = 4 * len(self.places)
         matrix, right = np.zeros((n, n)), np.zeros(n)
         for k in range(0, len(self.scan), max(len(self.scan) // SLICES, 1)):
-            columns, rest, weight, _ = self._slice(renderer, k)
+            columns, rest, weight, _ = self._slice(k)
             right += columns.gradient(rest, weight)[0].ravel()
             _add_band(matrix, columns.matrix(weight))
         matrix[np.diag_indices(n)] *= 1.001
@@ -414,7 +420,8 @@ class _Learning:
             cut, part = self._cut(rest, i, half + margin), height % 1
             image = ((1 - part) * cut[low] + part * cut[low + 1]) / place[3]
             off = np.rint(place[:2]) - place[:2]
-            around.append(shift(image, (0, *off), order=3)[:, margin:-margin, margin:-margin].ravel())
+            moved = np.stack([_shifted(one, off) for one in image])
+            around.append(moved[:, margin:-margin, margin:-margin].ravel())
         light = np.maximum(self.patterns[zone][0, :, :: self.fine, :: self.fine], 0)
         around = np.array(around) / np.sqrt(self.noise**2 + self.line[0] * light).ravel()
         size = np.sqrt((around**2).mean(axis=1))
@@ -433,14 +440,15 @@ class _Learning:
             self.modes = np.einsum("kl,lnij->knij", root, self.modes).astype(np.float32)
         else:
             self.modes = np.zeros((values.shape[1], *self.patterns.shape[1:]), np.float32)
+        self._prepare()
 
     def learn_coefficients(self) -> None:
         """Coefficients of the modes that fit best, each particle's for itself, the rest as it is."""
         if not len(self.modes):
             return
-        renderer, matrix, right = self._renderer(), 0, 0
+        matrix, right = 0, 0
         for k in range(0, len(self.scan), max(len(self.scan) // SLICES, 1)):
-            one, other = _each_alone(*self._slice(renderer, k, by_mode=True)[:3])
+            one, other = _each_alone(*self._slice(k, by_mode=True)[:3])
             matrix, right = matrix + one[:, 4:, 4:], right + other[:, 4:]
         right -= self.places[:, 4:]
         matrix += np.eye(len(self.modes))
@@ -521,10 +529,10 @@ class _Learning:
         It is that of particles from which the patterns were learned; M terms and modes learned from P particles make it
         smaller than for others by a factor 1 - M / P.
         """
-        renderer, slices, scatter = self._renderer(), np.arange(0, len(self.scan), max(len(self.scan) // 18, 1)), []
+        slices, scatter = np.arange(0, len(self.scan), max(len(self.scan) // 18, 1)), []
         smooth, size = self.terms @ self.surface[: self.terms.shape[1]], 4 + len(self.modes)
         for k in slices:
-            matrix, right = _each_alone(*self._slice(renderer, k, by_mode=True)[:3])
+            matrix, right = _each_alone(*self._slice(k, by_mode=True)[:3])
             matrix[:, np.arange(4, size), np.arange(4, size)] += 1
             right[:, 4:] -= self.places[:, 4:]
             inverse = np.linalg.inv(matrix + 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(size))
@@ -560,6 +568,14 @@ def _lags(profiles: NDArray, most: int) -> NDArray[np.float64]:
 def _along(matrix: NDArray[np.float64], patterns: NDArray) -> NDArray[np.float32]:
     """Matrix (N, N) applied along z to patterns (M, N, m, m)."""
     return np.einsum("kl,mlij->mkij", matrix.astype(np.float32), patterns, optimize=True).astype(np.float32)
+
+
+def _shifted(image: NDArray, off: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Image (m, m), square, shifted by `off` (down, to the right), px."""
+    to = np.array([[1, 0, off[1]], [0, 1, off[0]]])
+    return cv2.warpAffine(
+        image.astype(np.float32), to, image.shape, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
 
 
 def _blurred(images: NDArray[np.float32], width: int) -> NDArray[np.float32]:

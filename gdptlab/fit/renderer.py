@@ -177,10 +177,11 @@ class Renderer:
         shape: tuple[int, int],
         heights: NDArray[np.float64] | None = None,
         *,
+        derivatives: bool = True,
         by_mode: bool = False,
         room_px: int = 0,
     ) -> Columns:
-        """Draw particles, with derivatives.
+        """Draw particles.
 
         Parameters
         ----------
@@ -190,6 +191,8 @@ class Renderer:
             Of the frame; particles may be cut by its edges or lie outside.
         heights : float64 array (P,), optional
             Slices at which the particles are in focus, if not those of the focal surface.
+        derivatives : bool
+            Draw the derivatives by y, x and slice as well; without them these columns are undefined.
         by_mode : bool
             Append to the columns the derivative by each mode.
         room_px : int
@@ -202,7 +205,7 @@ class Renderer:
         starts = np.concatenate([[0], np.cumsum(capacity)])
         values = np.empty((4 + by_mode * self.modes, starts[-1]), dtype=np.float32)
         columns = Columns(boxes, starts, values, self.threads)
-        self._fill(columns, places, slices, terms, np.arange(len(places)))
+        self._fill(columns, places, slices, terms, np.arange(len(places)), derivatives)
         return columns
 
     def redraw(
@@ -216,7 +219,7 @@ class Renderer:
         if (_area(boxes) > np.diff(columns.starts)[which]).any():
             return False
         columns.boxes[which] = boxes
-        self._fill(columns, places, slices, terms, which)
+        self._fill(columns, places, slices, terms, which, True)
         return True
 
     def _slices(self, places: NDArray, terms: NDArray, heights: NDArray | None) -> NDArray[np.float64]:
@@ -224,19 +227,26 @@ class Renderer:
         return np.clip(places[:, 2] - (terms @ self.surface if heights is None else heights), -1.0, float(self.count))
 
     def _fill(
-        self, columns: Columns, places: NDArray, slices: NDArray, terms: NDArray, which: NDArray[np.int64]
+        self,
+        columns: Columns,
+        places: NDArray,
+        slices: NDArray,
+        terms: NDArray,
+        which: NDArray[np.int64],
+        derivatives: bool,
     ) -> None:
         """Fill the columns of the particles `which`."""
-        factors = np.zeros((len(places), len(self._nodes)), np.float32)
+        factors = np.zeros((len(places), self._nodes.shape[3]), np.float32)
         factors[:, : self.terms] = terms[:, : self.terms]
         factors[:, self.terms : self.terms + places.shape[1] - 4] = places[:, 4 : 4 + self.modes]
         size = 2 * self.half + 1
 
         def kernel(first: int, end: int) -> None:
             scratch = np.zeros((5, self.fine, self.fine, (size + RIM) * (size + RIM)), np.float32)
+            sums = np.zeros((4, size + RIM), np.float32)
             _draw(
                 self._nodes, factors, self.terms, self._differ, places, slices, which[first:end],
-                columns.boxes, columns.starts, columns.values, scratch,
+                columns.boxes, columns.starts, columns.values, derivatives, scratch, sums,
             )  # fmt: skip
 
         in_parts(self.threads, columns.area[which], kernel)
@@ -244,7 +254,7 @@ class Renderer:
     def image(self, places: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
         """Model image (rows, columns) of all particles at `places` (P, 4 + K)."""
         frame = np.zeros(shape, np.float32)
-        self.draw(places, shape).add_to(frame, places[:, 3])
+        self.draw(places, shape, derivatives=False).add_to(frame, places[:, 3])
         return frame
 
 
@@ -254,13 +264,18 @@ def _area(boxes: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _nodes(patterns: NDArray, fine: int) -> NDArray[np.float32]:
-    """Spline coefficients (T, N + 2, m + 2 RIM, fine, columns) of patterns (T, N, m, m), columns by phase."""
-    nodes = np.pad(patterns.astype(np.float64), ((0, 0), (0, 0), (RIM, RIM), (RIM, RIM)))
+    """Spline coefficients (N + 2, m + 2 RIM, fine, T, columns) of patterns (T, N, m, m), columns by phase.
+
+    All that a row of pixels needs lies together in memory. Of several terms the number is filled up to one that the
+    kernel can take by four.
+    """
+    more = -len(patterns) % 4 if len(patterns) > 1 else 0
+    nodes = np.pad(patterns.astype(np.float64), ((0, more), (0, 0), (RIM, RIM), (RIM, RIM)))
     for axis in (2, 3):
         nodes = spline_filter1d(nodes, axis=axis)
-    nodes = np.moveaxis(along_z(np.moveaxis(nodes, 1, 0)), 0, 1).astype(np.float32)
+    nodes = along_z(np.moveaxis(nodes, 1, 0)).astype(np.float32)  # N + 2, T, rows, columns
     nodes = np.pad(nodes, ((0, 0), (0, 0), (0, 0), (0, -nodes.shape[-1] % fine)))
-    return np.ascontiguousarray(np.moveaxis(nodes.reshape(*nodes.shape[:-1], -1, fine), -1, -2))
+    return np.ascontiguousarray(nodes.reshape(*nodes.shape[:-1], -1, fine).transpose(0, 2, 4, 1, 3))
 
 
 def along_z(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -307,15 +322,17 @@ def _spline(f):  # pragma: no cover
 
 
 @compiled
-def _draw(nodes, factors, terms, differ, places, slices, which, boxes, starts, values, scratch):  # pragma: no cover
+def _draw(
+    nodes, factors, terms, differ, places, slices, which, boxes, starts, values, derivatives, scratch, sums
+):  # pragma: no cover
     """Fill `values` of the particles `which`: along z over the nodes of the support, then x, then y.
 
-    Nodes are handled by phase, and those of one phase of rows and columns as one long line, a row after the other.
-    `scratch` (5, fine, fine, nodes) holds such lines: image, derivative by z, then the same and the derivative by x
-    between the nodes of a row.
+    Without `derivatives` only the image is drawn. Nodes are handled by phase, and those of one phase of rows and
+    columns as one long line, a row after the other. `scratch` (5, fine, fine, nodes) holds such lines: image,
+    derivative by z, then the same and the derivative by x between the nodes of a row; `sums` (4, nodes of a row) the
+    sum of the terms in four slices.
     """
-    _, levels, _, fine, width = nodes.shape
-    middle = nodes.shape[2] // 2
+    levels, middle, (_, fine, _, width) = len(nodes), nodes.shape[1] // 2, nodes.shape[1:]
     for i in which:
         y0, y1, x0, x1 = boxes[i]
         rows, columns = y1 - y0, x1 - x0
@@ -323,7 +340,7 @@ def _draw(nodes, factors, terms, differ, places, slices, which, boxes, starts, v
             continue
         k = min(max(int(np.floor(slices[i])), 0), levels - 4)
         z, dz = _spline(slices[i] - k)
-        used = len(nodes) if differ[0] <= k <= differ[1] else terms
+        used = nodes.shape[3] if differ[0] <= k <= differ[1] else terms
         top, left = fine * (y0 - places[i, 0]) + middle, fine * (x0 - places[i, 1]) + middle
         row, column = int(np.floor(top)) - 1, int(np.floor(left)) - 1
         v, dv = _spline(top - row - 1)
@@ -333,76 +350,79 @@ def _draw(nodes, factors, terms, differ, places, slices, which, boxes, starts, v
         for j in range(fine * (rows - 1) + 4):
             for p in range(fine):
                 s = (j // fine) * across
-                a, b = scratch[0, j % fine, p, s:], scratch[1, j % fine, p, s:]
-                for t in range(used):
-                    four = nodes[t, k : k + 4, row + j, p, begin:]
-                    _mix(four, z, dz, factors[i, t], across, a, b, t == 0)
-        for p in range(fine):
-            length = ((fine * (rows - 1) + 3 - p) // fine + 1) * across
-            _along_x(scratch[0, p], offset, h, length, scratch[2, p, 0])
-            _along_x(scratch[0, p], offset, dh, length, scratch[3, p, 0])
-            _along_x(scratch[1, p], offset, h, length, scratch[4, p, 0])
+                if used == 1:
+                    lines = nodes[k : k + 4, row + j, p, 0, begin:]
+                else:
+                    lines = sums
+                    for n in range(4):
+                        for t in range(0, used, 4):
+                            four = nodes[k + n, row + j, p, t : t + 4, begin:]
+                            _weighted(four, factors[i, t : t + 4], np.float32(1), across, sums[n], t > 0)
+                _weighted(lines, z, np.float32(1), across, scratch[0, j % fine, p, s:], False)
+                if derivatives:
+                    _weighted(lines, dz, np.float32(1), across, scratch[1, j % fine, p, s:], False)
         s, light, step = starts[i], np.float32(places[i, 3]), np.float32(-places[i, 3] * fine)
-        _along_y(scratch[2], dv, step, rows, columns, across, scratch[0, 0, 0], values[0, s:])
-        _along_y(scratch[3], v, step, rows, columns, across, scratch[0, 0, 0], values[1, s:])
-        _along_y(scratch[4], v, light, rows, columns, across, scratch[0, 0, 0], values[2, s:])
-        _along_y(scratch[2], v, np.float32(1), rows, columns, across, scratch[0, 0, 0], values[3, s:])
+        _along_x(scratch[0], offset, h, rows, across, scratch[2])
+        _along_y(scratch[2], v, np.float32(1), rows, columns, across, values[3, s:])
+        if not derivatives:
+            continue
+        _along_y(scratch[2], dv, step, rows, columns, across, values[0, s:])
+        _along_x(scratch[0], offset, dh, rows, across, scratch[3])
+        _along_y(scratch[3], v, step, rows, columns, across, values[1, s:])
+        _along_x(scratch[1], offset, h, rows, across, scratch[4])
+        _along_y(scratch[4], v, light, rows, columns, across, values[2, s:])
         for m in range(4, len(values)):
             if used == terms:
                 values[m, s : s + rows * columns] = 0
                 continue
             for j in range(fine * (rows - 1) + 4):
                 for p in range(fine):
-                    q = (j // fine) * across
-                    a, b = scratch[0, j % fine, p, q:], scratch[1, j % fine, p, q:]
-                    four = nodes[terms + m - 4, k : k + 4, row + j, p, begin:]
-                    _mix(four, z, dz, np.float32(1), across, a, b, True)
-            for p in range(fine):
-                length = ((fine * (rows - 1) + 3 - p) // fine + 1) * across
-                _along_x(scratch[0, p], offset, h, length, scratch[2, p, 0])
-            _along_y(scratch[2], v, light, rows, columns, across, scratch[0, 0, 0], values[m, s:])
+                    out = scratch[0, j % fine, p, (j // fine) * across :]
+                    _weighted(nodes[k : k + 4, row + j, p, terms + m - 4, begin:], z, np.float32(1), across, out, False)
+            _along_x(scratch[0], offset, h, rows, across, scratch[2])
+            _along_y(scratch[2], v, light, rows, columns, across, values[m, s:])
 
 
 @inlined
-def _mix(nodes, z, dz, factor, count, a, b, begin):  # pragma: no cover
-    """Set (`begin`) or add to `a` and `b` the nodes (4, columns) of four slices, weighted with `z` and with `dz`."""
-    n0, n1, n2, n3 = nodes[0], nodes[1], nodes[2], nodes[3]
-    z0, z1, z2, z3 = factor * z[0], factor * z[1], factor * z[2], factor * z[3]
-    d0, d1, d2, d3 = factor * dz[0], factor * dz[1], factor * dz[2], factor * dz[3]
-    if begin:
-        for j in range(count):
-            a[j] = z0 * n0[j] + z1 * n1[j] + z2 * n2[j] + z3 * n3[j]
-            b[j] = d0 * n0[j] + d1 * n1[j] + d2 * n2[j] + d3 * n3[j]
+def _weighted(lines, weights, factor, count, out, add):  # pragma: no cover
+    """Set `out` (count), or add to it, the sum of four `lines` with their `weights`, times a factor."""
+    a0, a1, a2, a3 = lines[0], lines[1], lines[2], lines[3]
+    w0, w1, w2, w3 = factor * weights[0], factor * weights[1], factor * weights[2], factor * weights[3]
+    if add:
+        for q in range(count):
+            out[q] += w0 * a0[q] + w1 * a1[q] + w2 * a2[q] + w3 * a3[q]
     else:
-        for j in range(count):
-            a[j] += z0 * n0[j] + z1 * n1[j] + z2 * n2[j] + z3 * n3[j]
-            b[j] += d0 * n0[j] + d1 * n1[j] + d2 * n2[j] + d3 * n3[j]
+        for q in range(count):
+            out[q] = w0 * a0[q] + w1 * a1[q] + w2 * a2[q] + w3 * a3[q]
 
 
 @inlined
-def _along_x(lines, offset, h, count, out):  # pragma: no cover
-    """Fill `out` (count): four nodes, of lines (fine, nodes) by phase, for each pixel, the first at `offset`."""
+def _along_x(lines, offset, h, rows, across, out):  # pragma: no cover
+    """Fill `out` (fine, 1, pixels) from lines (fine, fine, nodes): four nodes for each pixel, the first at `offset`."""
     fine = len(lines)
-    a0, a1 = lines[offset % fine, offset // fine :], lines[(offset + 1) % fine, (offset + 1) // fine :]
-    a2, a3 = lines[(offset + 2) % fine, (offset + 2) // fine :], lines[(offset + 3) % fine, (offset + 3) // fine :]
-    h0, h1, h2, h3 = h
-    for q in range(count):
-        out[q] = h0 * a0[q] + h1 * a1[q] + h2 * a2[q] + h3 * a3[q]
+    for p in range(fine):
+        count = ((fine * (rows - 1) + 3 - p) // fine + 1) * across
+        four = (
+            lines[p, offset % fine, offset // fine :],
+            lines[p, (offset + 1) % fine, (offset + 1) // fine :],
+            lines[p, (offset + 2) % fine, (offset + 2) // fine :],
+            lines[p, (offset + 3) % fine, (offset + 3) // fine :],
+        )
+        _weighted(four, h, np.float32(1), count, out[p, 0], False)
 
 
 @inlined
-def _along_y(lines, v, factor, rows, columns, across, line, image):  # pragma: no cover
+def _along_y(lines, v, factor, rows, columns, across, image):  # pragma: no cover
     """Fill `image` (rows * columns): four rows, of lines (fine, 1, pixels) by phase, for each pixel, times `factor`."""
     fine = len(lines)
-    c0, c1 = lines[0, 0], lines[1 % fine, 0, (1 // fine) * across :]
-    c2, c3 = lines[2 % fine, 0, (2 // fine) * across :], lines[3 % fine, 0, (3 // fine) * across :]
-    v0, v1, v2, v3 = factor * v[0], factor * v[1], factor * v[2], factor * v[3]
-    for q in range(rows * across):
-        line[q] = v0 * c0[q] + v1 * c1[q] + v2 * c2[q] + v3 * c3[q]
     for r in range(rows):
-        row, out = line[r * across :], image[r * columns :]
-        for q in range(columns):
-            out[q] = row[q]
+        four = (
+            lines[0, 0, r * across :],
+            lines[1 % fine, 0, (r + 1 // fine) * across :],
+            lines[2 % fine, 0, (r + 2 // fine) * across :],
+            lines[3 % fine, 0, (r + 3 // fine) * across :],
+        )
+        _weighted(four, v, factor, columns, image[r * columns :], False)
 
 
 @compiled
