@@ -89,7 +89,7 @@ class Alone:
         part = 1 / np.maximum((np.abs(change[:, :4]) / (LONGEST * scale)).max(axis=1), 1)
         gain += (part - part**2 / 2) * (right * change).sum(axis=1)
         trials = trials.copy()
-        trials[:, :change.shape[1]] += part[:, None] * change
+        trials[:, : change.shape[1]] += part[:, None] * change
         trials[:, 2] = np.clip(trials[:, 2], 0, self._renderer.count - 1)
         trials[:, 3] = np.maximum(trials[:, 3], FAINTEST * population.centre)
         return trials, gain, evidence
