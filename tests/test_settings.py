@@ -1,5 +1,7 @@
 """Settings from the frames themselves, and what can be overruled."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,13 +24,14 @@ def of(truth, frame):
     return truth[truth["frame"] == frame].drop(columns="frame").reset_index(drop=True)
 
 
-def test_joint_is_chosen_for_particles_that_are_alike(few, calibration, microscope) -> None:
+def test_joint_is_chosen_where_its_model_holds(few, calibration, microscope) -> None:
+    """For particles alike and of amplitudes 1 to 25, not for those of another microscope."""
     frame, particles = few
-    rng = np.random.default_rng(8)
     more = pd.concat([particles, particles.assign(x_px=particles["x_px"] - 16, z_um=-particles["z_um"])])
-    crowd = [microscope.render(more.assign(amplitude=b), frame.shape, rng=rng) for b in (1.0, np.geomspace(0.2, 5, 8))]
-    methods = [choose_settings([image], calibration).arguments["method"] for image in crowd]
-    assert methods == ["joint", "correlation"]
+    uneven, other = more.assign(amplitude=np.geomspace(0.2, 5, 8)), replace(microscope, cylinder_um=None)
+    for seen, by, method in ((more, microscope, "joint"), (uneven, microscope, "joint"), (more, other, "correlation")):
+        image = by.render(seen, frame.shape, rng=np.random.default_rng(8))
+        assert choose_settings([image], calibration).arguments["method"] == method
     assert choose_settings([frame], calibration).arguments["method"] == "correlation"  # too few to tell
 
 
