@@ -14,8 +14,8 @@ from gdptlab._files import written_whole
 from gdptlab.experiment import Method
 from gdptlab.experiment.channel import Acoustics, Focusing
 from gdptlab.experiment.film import Film
+from gdptlab.live import Monitor, Status, Trigger, middle_thirds
 from gdptlab.live.device import Device, closed_loop
-from gdptlab.live.monitor import Monitor, Status, Trigger, middle_thirds
 from gdptlab.live.own_process import OwnProcess
 
 AHEAD = 100  # frames rendered before a camera runs

@@ -24,8 +24,10 @@ from gdptlab.experiment import replay
 from gdptlab.experiment.channel import Channel
 from gdptlab.live import logbook
 from gdptlab.live.logbook import Logbook, read_log
-from gdptlab.live.monitor import Frame, MiddleThird, Monitor, Trigger, at_speed, middle_thirds
+from gdptlab.live.monitor import Monitor
 from gdptlab.live.own_process import OwnProcess
+from gdptlab.live.sources import Frame, at_speed
+from gdptlab.live.triggers import MiddleThird, Trigger, middle_thirds
 
 SHAPE = (3, 5)
 
@@ -327,9 +329,16 @@ def test_any_table_can_be_logged(tmp_path):
 
 @pytest.mark.parametrize("stamp", [np.float32(0.5), np.int64(3)])
 def test_a_time_may_be_a_scalar_of_numpy(stamp, tmp_path):
-    monitor = through([Frame(image(0), stamp)] * 3, log=tmp_path / "log")
-    assert monitor.status().evaluated == 3 and np.isnan(monitor.status().camera_hz)  # all at one time
-    assert read_log(tmp_path / "log")[0]["t_s"].tolist() == [float(stamp)] * 3
+    monitor = through([Frame(image(0), stamp)], log=tmp_path / "log")
+    assert monitor.status().evaluated == 1 and np.isnan(monitor.status().camera_hz)  # there is one time
+    assert read_log(tmp_path / "log")[0]["t_s"].tolist() == [float(stamp)]
+
+
+def test_times_that_repeat_or_go_back_are_refused_and_told(tmp_path):
+    frames = [Frame(image(0), t) for t in (1.0, 1.0, 0.5, 1.1)]
+    monitor = through(frames, log=tmp_path / "log")
+    assert (monitor.status().evaluated, monitor.status().failed) == (2, 2)
+    assert read_log(tmp_path / "log")[0]["error"].str.contains("the time").tolist() == [False, True, True, False]
 
 
 @pytest.mark.parametrize("stamp", [pd.Timedelta(1, "s"), "0.5", None, np.nan])

@@ -12,7 +12,7 @@ import pytest
 
 from gdptlab import plots
 from gdptlab.experiment.channel import Channel
-from gdptlab.live.monitor import Monitor, Trigger, middle_thirds
+from gdptlab.live import Monitor, Trigger, middle_thirds
 
 CHANNEL = Channel(width_um=120, height_um=60)
 

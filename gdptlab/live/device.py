@@ -19,8 +19,10 @@ from gdptlab._checks import choice, instance, instances, numbers, positive, whol
 from gdptlab.experiment.channel import Trajectories
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
-from gdptlab.live.monitor import Frame, MiddleThird, Monitor, Result, Trigger
+from gdptlab.live.monitor import Monitor, Result
 from gdptlab.live.own_process import PROCESSES, follow_parent
+from gdptlab.live.sources import Frame
+from gdptlab.live.triggers import MiddleThird, Trigger
 
 SLOTS = 16
 """Number of frames that may wait to be grabbed; while all slots are full, the camera's frames are lost and counted.

@@ -59,7 +59,7 @@ class OwnProcess:
                 f"evaluate: got {evaluate!r}, which cannot be sent to another process ({as_text(error)}); allowed is a "
                 "function from a module, not from a notebook's cells"
             ) from error
-        self._timeout_s = positive("timeout_s", timeout_s)
+        self._timeout_s, self.follows = positive("timeout_s", timeout_s), getattr(evaluate, "follows", False)
         self._process, self._number, self._one_caller, self._answered = None, 0, RLock(), False
 
     def __enter__(self) -> Self:
@@ -90,8 +90,8 @@ class OwnProcess:
                 self.stop()
                 raise
 
-    def __call__(self, image: NDArray) -> pd.DataFrame:
-        """Evaluate a frame in the process.
+    def __call__(self, *frame: Any) -> pd.DataFrame:
+        """Evaluate a frame in the process: what is given here is what the function there is called with.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class OwnProcess:
         """
         with self._one_caller:
             self.start()
-            table = self._answer(image, self._timeout_s if self._answered else max(START_S, self._timeout_s))
+            table = self._answer(frame, self._timeout_s if self._answered else max(START_S, self._timeout_s))
             self._answered = True
             return table
 
@@ -149,7 +149,7 @@ def _serve(connection: Any) -> None:
                 if evaluate is None:
                     evaluate = pickle.loads(request)
                 else:
-                    table = evaluate(request)
+                    table = evaluate(*request)
             except Exception as raised:
                 error = as_text(raised)
             connection.send((number, error, table))
