@@ -454,6 +454,100 @@ def test_the_example_is_evaluated_first_and_sets_the_shape():
         Monitor([], fails, example=image(0, 7)).start()
 
 
+# -------------------- sound off by default
+
+
+def safely(source, evaluate=ten, triggers=(), *, patience_s=0.3, ends="failed", within_s=20.0):
+    """Run a monitor to its end; it must have made safe, once."""
+    calls = []
+    with Monitor(source, evaluate, triggers, safe=lambda: calls.append(1), patience_s=patience_s) as monitor:
+        monitor._finished.wait(within_s)
+        assert monitor.status().state == ends
+    assert calls == [1]
+    if ends == "failed":
+        with pytest.raises(RuntimeError, match="failed"):
+            monitor.wait()
+    return monitor.status()
+
+
+def endless(**changes):
+    """A camera that goes wrong at its fourth frame."""
+    for k in range(10_000):
+        time.sleep(0.01)
+        frame, stamp = image(0.1), time.perf_counter()
+        if k >= 3 and "shape" in changes:
+            frame = np.zeros(changes["shape"])
+        if k >= 3 and "stamp" in changes:
+            stamp = changes["stamp"]
+        yield Frame(frame, stamp)
+
+
+def test_a_camera_that_stalls_makes_safe():
+    status = safely(Hand(image(0.1)))
+    assert "no frame could be evaluated for 0.3 s" in status.error and status.evaluated == 1
+
+
+@pytest.mark.parametrize(("changes", "word"), [({"shape": (4, 4)}, "shape"), ({"stamp": 1e-3}, "the time")])
+def test_a_camera_whose_frames_are_refused_makes_safe(changes, word):
+    status = safely(endless(**changes))
+    assert word in status.error and status.evaluated <= 3
+
+
+def test_an_evaluator_that_hangs_or_diverges_makes_safe():
+    def diverges(frame):
+        raise FloatingPointError("the joint fit diverged")
+
+    assert "diverged" in safely(endless(), diverges).error
+    gate = threading.Event()
+    assert "no frame" in safely(endless(), lambda frame: gate.wait(20) and ten(frame)).error
+    gate.set()
+
+
+def test_a_device_that_does_not_answer_makes_safe():
+    def refuses(result):
+        raise TimeoutError("no answer")
+
+    assert "no answer" in safely([image(1.0)] * 3, triggers=[trigger(action=refuses)]).error
+    gate = threading.Event()
+    safely(endless(), lambda f: ten(image(1.0)), [trigger(action=lambda result: gate.wait(20))])
+    gate.set()
+
+
+def test_a_source_that_breaks_makes_safe():
+    def breaks():
+        yield image(0.1)
+        time.sleep(0.05)
+        raise OSError("cable pulled")
+
+    assert "cable pulled" in safely(breaks()).error
+
+
+def test_the_end_and_a_stop_make_safe_too_and_few_bad_frames_do_not():
+    safely([image(0.1)], ends="ended")
+    safely(endless(), ends="running", within_s=0.1)  # and then stopped
+    monitor = through([image(0.1), np.zeros((4, 4)), image(0.2)], safe=list, patience_s=20.0)
+    assert monitor.status().state == "ended" and monitor.status().failed == 1
+
+
+def test_what_is_safe_may_fail_and_is_told():
+    with Monitor([image(0.1)], ten, safe=lambda: 1 / 0) as monitor, pytest.raises(RuntimeError, match="ZeroDivision"):
+        monitor.wait(20)
+
+
+def test_an_evaluator_that_follows_is_given_the_time_and_says_how(tmp_path):
+    def follows(frame, t_s):
+        table = ten(frame)
+        table.attrs |= {"method": "joint" if t_s < 2 else "correlation", "note": "" if t_s < 2 else "too slow"}
+        return table
+
+    follows.follows = True
+    frames = [Frame(image(0.1), t) for t in (1.0, 2.0)]
+    monitor = through(frames, follows, log=tmp_path / "log")
+    assert monitor.status().method == "correlation"
+    log, _ = read_log(tmp_path / "log")
+    assert log["method"].tolist() == ["joint", "correlation"] and log["note"].tolist()[1] == "too slow"
+
+
 # -------------------- the log
 
 
@@ -807,6 +901,9 @@ def test_a_process_of_its_own_finds_the_same(few, calibration):
         (lambda: Monitor([], ten, ["w"]), TypeError, "triggers"),
         (lambda: Monitor([], ten, [trigger(), trigger()]), TypeError, "triggers"),
         (lambda: Monitor([], ten, window=1), ValueError, "window"),
+        (lambda: Monitor([], ten, safe=1), TypeError, "safe"),
+        (lambda: Monitor([], ten, safe=print, patience_s=0), ValueError, "patience_s"),
+        (lambda: OwnProcess(ten, niceness=20), ValueError, "niceness"),
         (lambda: Monitor([], ten, example=[1]), ValueError, "example"),
         (lambda: trigger(""), TypeError, "name"),
         (lambda: trigger(action=None), TypeError, "action"),

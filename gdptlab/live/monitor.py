@@ -109,6 +109,8 @@ class Status:
         Since the last frame came, or the start.
     count : int
         Number of particles in the last frame that was evaluated.
+    method : str
+        How the evaluator says that it evaluated that frame; empty if it says nothing.
     fraction, on : dict
         Of each trigger, by name.
     actions_failed : int
@@ -133,6 +135,7 @@ class Status:
     latency_max_ms: float
     waiting_s: float
     count: int
+    method: str
     fraction: dict[str, float]
     on: dict[str, bool]
     actions_failed: int
@@ -334,6 +337,7 @@ class Monitor:
                 latency_max_ms=float(latency.max()),
                 waiting_s=perf_counter() - since,
                 count=self._count,
+                method="" if self._latest is None else self._latest.table.attrs.get("method", ""),
                 fraction=dict(self._fraction),
                 on=dict(self._on),
                 actions_failed=self._actions_failed,

@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from gdptlab._checks import iterable, number, positive, rate
+from gdptlab._checks import instance, iterable, number, positive, rate
 from gdptlab._checks import path as check_path
 
 POLL_S = 0.002
@@ -97,6 +97,8 @@ class FillingFolder:
         self._folder, self._pattern = check_path("folder", folder), pattern
         if not self._folder.is_dir():
             raise FileNotFoundError(f"folder: got {str(folder)!r}, allowed is a folder")
+        if not instance("pattern", pattern, str) or "/" in pattern or "\\" in pattern or "**" in pattern:
+            raise ValueError(f"pattern: got {pattern!r}, allowed is one of names, such as *.tif")
         self._patience_s = positive("patience_s", patience_s)
         self._last = max((p.name for p in self._folder.glob(pattern)), default="")
         self._sizes: dict[str, int] = {}
