@@ -26,10 +26,10 @@ FORGET_S = 0.5
 the channel's height, and changes its velocity on the way. With 0.1, a pause of the camera would cost a search; with 2,
 particles would be looked for where they are not."""
 
-REPEATS, LOST = 3, 1.2
-"""Largest number of times that a frame is fitted again, and the factor by which its mean squared residual must exceed
-that of the frame before for that. Chosen: the residual is 1.0 to 1.2 where all is found and 2 to 8 where a third is
-lost; one repeat finds nearly all of them, the second the rest."""
+REPEATS, LOST, HOPELESS = 3, 1.2, 2.0
+"""Largest number of times that a frame is fitted again; the factor by which its mean squared residual must exceed that
+of the frame before for that; and the factor from which on all particles are sought anew. Chosen: the residual is 0.95
+to 1.2 where all is found and 2 to 8 where a third is lost; one repeat finds nearly all of them, the second the rest."""
 
 SLOW = 3
 """Number of frames in a row that must take longer than the interval for the next to be left to the cheaper evaluator.
@@ -149,7 +149,7 @@ class Follower:
                     break
                 found = joint.following(image, replace(found, places=_moved_back(found)))
             tried.append(replace(found, velocity=found.velocity / gap_s))
-        if not tried or unexplained(tried[0]) > LOST * usual:
+        if not tried or unexplained(tried[0]) > HOPELESS * usual:
             tried.append(joint.first(image))
         found = min(tried, key=unexplained)
         table = self._joint.table(found)
