@@ -124,18 +124,23 @@ def test_pictures_that_cannot_be_drawn_stop_nothing(monitor):
         assert panel.png() == b""
 
 
-def test_latencies_fall_from_left_to_right():
-    runs = {"a": pd.DataFrame({"t_s": [0.0, 0.1, 0.2, 0.3], "latency_ms": [5.0, 9.0, 7.0, 6.0]})}
-    line, tail = plots.latencies(runs, {"allowed": 8}).axes
-    np.testing.assert_array_equal(line.get_lines()[0].get_ydata(), [5, 9, 7, 6])
-    np.testing.assert_array_equal(tail.get_lines()[0].get_xydata(), [[0.25, 9], [0.5, 7], [0.75, 6], [1, 5]])
+def test_what_was_seen_stands_beside_what_is_true():
+    seen = pd.DataFrame({"t_s": [0.0, 0.1]})
+    for of in "hw":
+        seen = seen.assign(**{f"{what}_{of}": [0.4, 0.95] for what in ("true", "correlation", "joint")})
+        seen[f"joint_{of}_low"] = [0.3, 0.8]
+    for axes in plots.seen_and_true(seen, 0.9).axes:
+        np.testing.assert_array_equal(axes.get_lines()[1].get_ydata(), [0.4, 0.95])
+        assert axes.collections[0].get_paths()[0].get_extents().y0 == 0.3
 
 
-def test_one_loop_and_many():
-    true = pd.DataFrame({"t_s": [0.0, 1.0], "fraction_w": [0.3, 0.95]})
-    recent = pd.DataFrame({"t_s": [0.1, 0.9], "fraction": [0.3, 0.9]})
-    (axes,) = plots.one_loop(recent, true, 0.95, 0.9).axes
-    assert axes.texts[0].get_text() == "sound off at 0.95 s"
+def test_off_times_count_those_that_never_are():
+    decided = pd.DataFrame({"way": "joint", "of": "h", "true_s": 1.0, "off_s": [1.02, 0.9, np.nan, 1.2]})
+    (step,) = plots.off_times(decided, 0.1).axes[0].get_lines()
+    np.testing.assert_allclose(step.get_xydata(), [[-1, 0], [-0.1, 25], [0.02, 50], [0.2, 75], [1, 75]], atol=1e-9)
+
+
+def test_loops_and_timer():
     loop = pd.DataFrame({"energy_density_J_m3": [4.0, 6.0], "needed_s": [1.2, 0.9], "off_s": [1.3, 1.0]})
     loop["true_fraction"] = [0.95, 0.89]
     timers = pd.DataFrame(

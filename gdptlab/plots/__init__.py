@@ -30,7 +30,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "frames": ["circled", "contact_sheet", "draw_in_space", "frame_with_particles", "particles_3d", "side_by_side"],
         "knobs": ["panel", "slide"],
         "limits": ["biases", "errors_against_bound", "expected_errors"],
-        "live": ["latencies", "loop_and_timer", "one_loop"],
+        "live": ["loop_and_timer", "off_times", "seen_and_true"],
         "watching": ["LivePage", "LivePanel", "live_panel", "watch_live"],
         "notebook": ["all_measured", "end_notebook", "keep_measured", "measured_lines", "quote_measured"],
         "overlap": ["RESIDUAL_END", "error_ratios", "film_followed", "found_and_left", "laid_bare"],

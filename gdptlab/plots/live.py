@@ -11,41 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from gdptlab.plots.experiment import LINES, TRIGGER_COLOURS
-from gdptlab.plots.style import COLOURS, MARKERS, panels, styled
-
-
-@styled
-def latencies(runs: Mapping[str, pd.DataFrame], limits_ms: Mapping[str, float]) -> Figure:
-    """Plot how long after its delivery each frame was decided on, for several runs of a monitor.
-
-    Parameters
-    ----------
-    runs : dict of DataFrame
-        From `Monitor.recent`, by name.
-    limits_ms : dict of float
-        Horizontal lines, by name.
-
-    Returns
-    -------
-    Figure
-        On the left in time, on the right the fraction of frames that took longer.
-    """
-    figure, [[line, tail]] = panels(2, 10, 3.2, width_ratios=[1.7, 1], sharey=True)
-    for i, (name, recent) in enumerate(runs.items()):
-        late = np.sort(recent["latency_ms"])[::-1]
-        line.plot(
-            recent["t_s"], recent["latency_ms"], MARKERS[i], color=COLOURS[i], ms=3, mfc="none", mew=0.7, label=name
-        )
-        tail.step((np.arange(len(late)) + 1) / len(late), late, color=COLOURS[i], ls=LINES[i % 4], where="pre")
-    for name, limit in limits_ms.items():
-        for panel in (line, tail):
-            panel.axhline(limit, color="0.45", lw=1, ls=":")
-        tail.annotate(name, (1, limit), (-2, 2), xycoords=("axes fraction", "data"), textcoords="offset points",
-                      ha="right", fontsize="small", color="0.3")  # fmt: skip
-    tail.set(xscale="log", xlabel="fraction of frames that took longer")
-    line.set(xlabel="the frame came at t (s)", ylabel="decided after (ms)", ylim=(0, None))
-    figure.legend(*line.get_legend_handles_labels(), loc="outside upper center", ncols=len(runs))
-    return figure
+from gdptlab.plots.style import COLOURS, panels, styled
 
 
 @styled
@@ -93,32 +59,58 @@ def loop_and_timer(loop: pd.DataFrame, timers: pd.DataFrame, level: float, chose
 
 
 @styled
-def one_loop(recent: pd.DataFrame, true: pd.DataFrame, off_s: float, level: float, of: str = "w") -> Figure:
-    """Plot one experiment in which the monitor switched the sound off.
+def seen_and_true(seen: pd.DataFrame, level: float) -> Figure:
+    """Plot the two fractions of one experiment against time: true, by correlation, and by the joint fit with its band.
 
     Parameters
     ----------
-    recent : DataFrame
-        Frames looked at: `t_s` since the sound was switched on, and `fraction`.
-    true : DataFrame
-        From `device.true_fractions`.
-    off_s : float
-        When the sound went off.
+    seen : DataFrame
+        A row for each frame: `t_s`; for each trigger `true_h`, `correlation_h`, `joint_h`, `joint_h_low`, and the same
+        with `w`.
     level : float
         Fraction that triggers.
-    of : str
-        'h' or 'w'.
 
     Returns
     -------
     Figure
     """
-    figure, [[axes]] = panels(1, 8, 3.2)
-    axes.axvspan(0, off_s, color=TRIGGER_COLOURS[of], alpha=0.1, lw=0)
-    axes.axhline(level, color="black", lw=0.8, ls=":")
-    axes.plot(true["t_s"], true[f"fraction_{of}"], color=TRIGGER_COLOURS[of], lw=1, ls=LINES[1], label="true")
-    axes.plot(recent["t_s"], recent["fraction"], "o", color=TRIGGER_COLOURS[of], ms=3, label="measured")
-    axes.annotate(f"sound off at {off_s:.2f} s", (off_s, 0.32), (4, 0), textcoords="offset points")
-    axes.set(xlabel="t (s)", ylabel=f"fraction of particles in {of}/3", ylim=(0.2, 1.05), xlim=(0, true["t_s"].max()))
-    axes.legend(loc="lower right")
+    figure, [axes] = panels(2, 10, 3.4, sharey=True)
+    for panel, (of, colour) in zip(axes, TRIGGER_COLOURS.items(), strict=True):
+        panel.axhline(level, color="black", lw=0.8, ls=":")
+        panel.plot(seen["t_s"], seen[f"true_{of}"], color="black", lw=1, label="true")
+        panel.plot(seen["t_s"], seen[f"correlation_{of}"], "s", color="0.5", ms=4, mfc="none", label="correlation")
+        panel.fill_between(seen["t_s"], seen[f"joint_{of}_low"], seen[f"joint_{of}"], color=colour, alpha=0.2, lw=0)
+        panel.plot(seen["t_s"], seen[f"joint_{of}"], "o", color=colour, ms=4, label="joint fit, lower bound")
+        panel.set(xlabel="t (s)", title=f"{of}/3", ylim=(0.1, 1.05))
+        panel.legend(loc="lower right", fontsize="small")
+    axes[0].set_ylabel("fraction of the particles in view")
+    return figure
+
+
+@styled
+def off_times(decided: pd.DataFrame, near_s: float) -> Figure:
+    """Plot the fraction of experiments in which the sound is off, against the time since it should have been.
+
+    Parameters
+    ----------
+    decided : DataFrame
+        A row for each experiment and way: `way`, `of`, `off_s` (NaN: never) and `true_s`.
+    near_s : float
+        Difference that counts as in time: the grey area.
+
+    Returns
+    -------
+    Figure
+    """
+    figure, [axes] = panels(2, 10, 3.4, sharey=True)
+    for panel, of in zip(axes, "hw", strict=True):
+        panel.axvspan(-near_s, near_s, color="0.9", lw=0)
+        for i, (way, part) in enumerate(decided[decided["of"] == of].groupby("way", sort=False)):
+            late = np.sort((part["off_s"] - part["true_s"]).dropna())
+            n = np.arange(len(late) + 1) / len(part)
+            panel.step(np.concatenate([[-1], late, [1]]), 100 * np.append(n, n[-1]), where="post",
+                       color=COLOURS[i], ls=LINES[i % 4], label=way)  # fmt: skip
+        panel.set(xlabel="after the true trigger (s)", title=f"{of}/3", xlim=(-0.6, 0.6), ylim=(-3, 103))
+    axes[0].set_ylabel("sound is off (%)")
+    axes[0].legend(fontsize="small", loc="upper left")
     return figure

@@ -209,6 +209,8 @@ def drawn(seen: tuple[Result | None, pd.DataFrame, Status], **settings: Any) -> 
 def watch_live(monitor: Monitor, *, period_s: float = 1.0, **settings: Any) -> None:
     """Show `live_panel` in a notebook, again and again, until the monitor's source has ended.
 
+    A monitor that has not started is started when all that drawing takes is there.
+
     Parameters
     ----------
     monitor, period_s, **settings
@@ -218,6 +220,9 @@ def watch_live(monitor: Monitor, *, period_s: float = 1.0, **settings: Any) -> N
 
     shown, ended = None, False
     with LivePanel(monitor, period_s=period_s, **settings) as panel:
+        if monitor.status().state == "ready":
+            panel.png()
+            monitor.start()
         while not ended:
             ended = monitor.wait(period_s)
             picture = Image(panel.png())
