@@ -498,9 +498,12 @@ def test_an_evaluator_that_hangs_or_diverges_makes_safe():
         raise FloatingPointError("the joint fit diverged")
 
     assert "diverged" in safely(endless(), diverges).error
-    gate = threading.Event()
-    assert "no frame" in safely(endless(), lambda frame: gate.wait(20) and ten(frame)).error
+    gate, acted = threading.Event(), []
+    late = trigger(action=acted.append, level=0.05, release=0.0)
+    assert "no frame" in safely(endless(), lambda frame: gate.wait(20) and ten(frame), [late]).error
     gate.set()
+    time.sleep(0.1)
+    assert acted == []  # what comes after it was made safe switches nothing
 
 
 def test_a_device_that_does_not_answer_makes_safe():

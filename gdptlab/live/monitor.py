@@ -427,6 +427,8 @@ class Monitor:
                 break
             number, frame = taken
             result = self._decided(number, frame, number - last - 1)
+            if self._over:
+                break  # it failed meanwhile, and made safe: nothing is switched any more
             last = number
             failures = self._acted(result)
             self._noted(result, failures)
