@@ -98,11 +98,11 @@ def test_it_is_drawn_until_the_source_ends(monitor, monkeypatch):
     display = types.SimpleNamespace(display=lambda p, display_id: shown.append(p) or handle, Image=bytes)
     monkeypatch.setitem(sys.modules, "IPython.display", display)
     monkeypatch.setattr(watching.LivePanel, "__enter__", lambda self: self)  # no process
-    monkeypatch.setattr(watching.LivePanel, "png", lambda self: b"picture")
+    monkeypatch.setattr(watching.LivePanel, "png", lambda self, at_once: b"last" if at_once else b"picture")
     waits = iter([False, False, True])
     monkeypatch.setattr(monitor, "wait", lambda seconds: next(waits))
     plots.watch_live(monitor, period_s=0.1, channel=CHANNEL, to_channel=to_channel)
-    assert shown == [b"picture"] * 3
+    assert shown == [b"picture", b"picture", b"last"]
 
 
 def test_a_page_shows_the_picture_that_another_process_drew(monitor):

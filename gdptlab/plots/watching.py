@@ -183,11 +183,11 @@ class LivePanel:
     def __exit__(self, *_: object) -> None:
         self._draw.stop()
 
-    def png(self) -> bytes:
-        """Return the picture as PNG: a new one if it is time for that, else the one before."""
+    def png(self, at_once: bool = False) -> bytes:
+        """Return the picture as PNG: a new one if it is time for that, or wanted at once, else the one before."""
         with self._one_at_a_time:
             start = perf_counter()
-            if start >= self._next_s:
+            if at_once or start >= self._next_s:
                 monitor = self._monitor
                 try:
                     self._png = self._draw((monitor.latest, monitor.recent(), monitor.status()))
@@ -225,7 +225,7 @@ def watch_live(monitor: Monitor, *, period_s: float = 1.0, **settings: Any) -> N
             monitor.start()
         while not ended:
             ended = monitor.wait(period_s)
-            picture = Image(panel.png())
+            picture = Image(panel.png(at_once=ended))  # the last shows the end
             if shown is None:
                 shown = display(picture, display_id=True)
             else:
