@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from gdptlab import Calibration, locate, plots
+from gdptlab import Calibration, datasets, locate
 from gdptlab._files import written_whole
 from gdptlab.experiment import trigger_time
 from gdptlab.experiment.channel import Acoustics, Focusing
 from gdptlab.experiment.film import Film
 from gdptlab.live import Follower, middle_thirds, true_fractions
 
-PATH = plots.FIGURES.parent / "data" / "live_loops.parquet"
+PATH = datasets.DATA / "live_loops.parquet"
 E_AC, SCATTER, LEVEL = 6.0, 0.3, 0.9
 FIRST_SEED = 1000
 AFTER_S = 0.3  # for which frames are evaluated after the last of the true trigger times
