@@ -14,8 +14,8 @@ from gdptlab._files import written_whole
 from gdptlab.experiment import Method
 from gdptlab.experiment.channel import Acoustics, Focusing
 from gdptlab.experiment.film import Film
+from gdptlab.live import Follower, Monitor, Status, Trigger, middle_thirds
 from gdptlab.live.device import Device, closed_loop
-from gdptlab.live.monitor import Monitor, Status, Trigger, middle_thirds
 from gdptlab.live.own_process import OwnProcess
 
 AHEAD = 100  # frames rendered before a camera runs
@@ -45,14 +45,23 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def watched(device: Device, film: Film, evaluate: object) -> tuple[Status, float]:
-    """Status of a monitor after the film, and MB by which the peak of memory rose."""
+def watched(device: Device, film: Film, evaluate: object, panel: bool = False) -> tuple[Status, float]:
+    """Status of a monitor after the film, with or without a panel, and MB by which the peak of memory rose."""
     channel = film.trajectories.focusing.channel
     triggers = [Trigger(name=of, fraction=s, action=str) for of, s in middle_thirds(channel, film.to_channel).items()]
     example, before = film[0], peak_mb()
     device.run(film, ahead=min(AHEAD, len(film)))
-    with Monitor(device, evaluate, triggers, example=example) as monitor:
+    monitor = Monitor(device, evaluate, triggers, example=example, window=10_000)
+    if panel:
+        with plots.LivePanel(monitor, channel=channel, to_channel=film.to_channel) as drawing:
+            drawing.png()
+            monitor.start()
+            while not monitor.wait(0.2):
+                drawing.png()
+    else:
+        monitor.start()
         monitor.wait()
+    monitor.stop()
     return monitor.status(), peak_mb() - before
 
 
@@ -79,6 +88,19 @@ def main() -> None:
                 note(f"{what}: dropped", len(film) - status.evaluated, "", "0")
                 note(f"{what}: median latency", status.latency_median_ms, "ms", "30")
                 note(f"{what}: 99th percentile", status.latency_p99_ms, "ms", "80")
+        calibration = Calibration.from_stack(*film.stack(size=2 * SIZE_PX + 1), n_sub=9)
+        for in_view, rate_hz in ((100.0, 25.0), (50.0, 50.0)):
+            followed = film_of(rate_hz, options.seconds, in_view=in_view)
+            follower = Follower(calibration, interval_s=1 / rate_hz, cheaper=refined, threads=2)
+            with OwnProcess(follower) as apart:
+                for with_panel in (False, True):
+                    status, _ = watched(device, followed, apart, with_panel)
+                    what = f"joint fit, {rate_hz:g} frames/s, {in_view:g} in view" + ", with the panel" * with_panel
+                    note(f"{what}: frames", len(followed), "", "")
+                    note(f"{what}: dropped", len(followed) - status.evaluated, "", "0")
+                    note(f"{what}: median latency", status.latency_median_ms, "ms", "")
+                    note(f"{what}: 99th percentile", status.latency_p99_ms, "ms", f"{1e3 / rate_hz:g}")
+                    note(f"{what}: longest", status.latency_max_ms, "ms", "")
         fast = film_of(100.0, options.seconds)
         status, _ = watched(device, fast, method_of(fast, 4, refine=False))
         what = "100 frames/s, not refined, N_sub = 4"

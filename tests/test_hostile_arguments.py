@@ -249,6 +249,8 @@ def calls(folder: Path) -> dict[str, Call]:
         "tracking.save_paraview_tracks": call(tracking.save_paraview_tracks, tracks=TRUTH, path=folder / "tracks.pvd"),
         "tracking.velocities": call(tracking.velocities, tracks=TRACKS, frame_rate_hz=25.0, window=5),
         "tracking.without_drift": call(tracking.without_drift, table=RESTING, drift=tracking.drift(RESTING, [0, 1])),
+        "live.FillingFolder": call(live.FillingFolder, folder=folder, pattern="*.tif*", patience_s=1.0),
+        "live.Follower": call(followed, calibration=CALIBRATION, threads=2, image=SCAN[3], t_s=0.5),
         "live.Frame": call(live.Frame, image=IMAGE, t_s=0.5),
         "live.MiddleThird": call(live.MiddleThird, of="h", channel=Channel(), to_channel=FILM.to_channel),
         "live.Monitor": call(
@@ -259,6 +261,7 @@ def calls(folder: Path) -> dict[str, Call]:
         "live.OwnProcess": call(live.OwnProcess, evaluate=gdptlab.locate),
         "live.Switched": call(Switched, **fields, off_s=0.1),
         "live.Switched.table": call(Switched(**fields, off_s=0.1).table, times_s=[0.0, 0.15]),
+        "live.over_http": call(live.over_http, url="http://127.0.0.1:9", data=b"off", timeout_s=0.1),
         "live.at_speed": call(played, frames=[IMAGE], rate_hz=1e3),
         "live.middle_thirds": call(live.middle_thirds, channel=Channel(), to_channel=FILM.to_channel),
         "live.read_log": call(live.read_log, path=folder / "log"),
@@ -283,6 +286,11 @@ def closed(**given):
     live.Logbook(**given).close()
 
 
+def followed(image, t_s, **given):
+    """A frame, by the joint fit in the loop."""
+    return live.Follower(**given)(image, t_s)
+
+
 def played(**given):
     """All frames, at their speed."""
     return list(live.at_speed(**given))
@@ -303,6 +311,9 @@ NOT_CALLED = {
     "pipeline.ScanReport": "returned",
     "pipeline.Settings": "returned",
     "live.Device": "a process; see `test_device.py`",
+    "live.Fraction": "returned",
+    "live.MicroManagerCamera": "takes what `pymmcore_plus` makes; see `test_sources.py`",
+    "live.over_serial": "needs an extra; see `test_sources.py`",
     "live.Result": "returned",
     "live.Status": "returned",
     "live.closed_loop": "a process and a second of its time; see `test_device.py`",

@@ -45,7 +45,7 @@ SMALL = {
     "09": {"n_others": 1, "n_jobs": 1, "modes": 0},
     "10": {"n_beads": 4, "n_frames": 2, "crowds": (25,), "noises": (38.0,), "n_crowded": 2},
     "11": {"duration_s": 3.0, "factors": (1,), "n_films": 3, "n_measured": 1, "measured_s": 2.0, "n_jobs": 1},
-    "12": {"rate_s": 1.0, "fast_s": 0.5, "flood_s": 0.5, "n_loops": 1, "n_joint": 3, "ahead": 25},
+    "12": {"live_s": 1.0, "n_again": 2, "n_loops": 8},
 }
 """Settings of size, by the number of the notebook."""
 
@@ -80,7 +80,7 @@ CHANGED = [
     ("09", {"n_sub": 7, "threshold": 0.6}),
     ("10", {"noise": 60.0, "seed": 5}),
     ("11", {"E_ac": 2.4, "mean_in_view": 30.0, "crowd_in_view": 60.0}),
-    ("12", {"mean_in_view": 50.0, "n_sub": 6}),
+    ("12", {"live_in_view": 25.0, "n_sub": 6, "level": 0.85, "tau_s": 0.12}),
     ("13", {"threshold": 0.6, "method": "correlation", "frame_number": 0}),
 ]
 

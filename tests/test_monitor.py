@@ -24,8 +24,10 @@ from gdptlab.experiment import replay
 from gdptlab.experiment.channel import Channel
 from gdptlab.live import logbook
 from gdptlab.live.logbook import Logbook, read_log
-from gdptlab.live.monitor import Frame, MiddleThird, Monitor, Trigger, at_speed, middle_thirds
+from gdptlab.live.monitor import Monitor
 from gdptlab.live.own_process import OwnProcess
+from gdptlab.live.sources import Frame, at_speed
+from gdptlab.live.triggers import MiddleThird, Trigger, middle_thirds
 
 SHAPE = (3, 5)
 
@@ -327,9 +329,16 @@ def test_any_table_can_be_logged(tmp_path):
 
 @pytest.mark.parametrize("stamp", [np.float32(0.5), np.int64(3)])
 def test_a_time_may_be_a_scalar_of_numpy(stamp, tmp_path):
-    monitor = through([Frame(image(0), stamp)] * 3, log=tmp_path / "log")
-    assert monitor.status().evaluated == 3 and np.isnan(monitor.status().camera_hz)  # all at one time
-    assert read_log(tmp_path / "log")[0]["t_s"].tolist() == [float(stamp)] * 3
+    monitor = through([Frame(image(0), stamp)], log=tmp_path / "log")
+    assert monitor.status().evaluated == 1 and np.isnan(monitor.status().camera_hz)  # there is one time
+    assert read_log(tmp_path / "log")[0]["t_s"].tolist() == [float(stamp)]
+
+
+def test_times_that_repeat_or_go_back_are_refused_and_told(tmp_path):
+    frames = [Frame(image(0), t) for t in (1.0, 1.0, 0.5, 1.1)]
+    monitor = through(frames, log=tmp_path / "log")
+    assert (monitor.status().evaluated, monitor.status().failed) == (2, 2)
+    assert read_log(tmp_path / "log")[0]["error"].str.contains("the time").tolist() == [False, True, True, False]
 
 
 @pytest.mark.parametrize("stamp", [pd.Timedelta(1, "s"), "0.5", None, np.nan])
@@ -443,6 +452,103 @@ def test_the_example_is_evaluated_first_and_sets_the_shape():
     assert through([image(0.4)], example=np.zeros((4, 4))).status().failed == 1
     with pytest.raises(RuntimeError, match="example"):
         Monitor([], fails, example=image(0, 7)).start()
+
+
+# -------------------- sound off by default
+
+
+def safely(source, evaluate=ten, triggers=(), *, patience_s=0.3, ends="failed", within_s=20.0):
+    """Run a monitor to its end; it must have made safe, once."""
+    calls = []
+    with Monitor(source, evaluate, triggers, safe=lambda: calls.append(1), patience_s=patience_s) as monitor:
+        monitor._finished.wait(within_s)
+        assert monitor.status().state == ends
+    assert calls == [1]
+    if ends == "failed":
+        with pytest.raises(RuntimeError, match="failed"):
+            monitor.wait()
+    return monitor.status()
+
+
+def endless(**changes):
+    """A camera that goes wrong at its fourth frame."""
+    for k in range(10_000):
+        time.sleep(0.01)
+        frame, stamp = image(0.1), time.perf_counter()
+        if k >= 3 and "shape" in changes:
+            frame = np.zeros(changes["shape"])
+        if k >= 3 and "stamp" in changes:
+            stamp = changes["stamp"]
+        yield Frame(frame, stamp)
+
+
+def test_a_camera_that_stalls_makes_safe():
+    status = safely(Hand(image(0.1)))
+    assert "no frame could be evaluated for 0.3 s" in status.error and status.evaluated == 1
+
+
+@pytest.mark.parametrize(("changes", "word"), [({"shape": (4, 4)}, "shape"), ({"stamp": 1e-3}, "the time")])
+def test_a_camera_whose_frames_are_refused_makes_safe(changes, word):
+    status = safely(endless(**changes))
+    assert word in status.error and status.evaluated <= 3
+
+
+def test_an_evaluator_that_hangs_or_diverges_makes_safe():
+    def diverges(frame):
+        raise FloatingPointError("the joint fit diverged")
+
+    assert "diverged" in safely(endless(), diverges).error
+    gate, acted = threading.Event(), []
+    late = trigger(action=acted.append, level=0.05, release=0.0)
+    assert "no frame" in safely(endless(), lambda frame: gate.wait(20) and ten(frame), [late]).error
+    gate.set()
+    time.sleep(0.1)
+    assert acted == []  # what comes after it was made safe switches nothing
+
+
+def test_a_device_that_does_not_answer_makes_safe():
+    def refuses(result):
+        raise TimeoutError("no answer")
+
+    assert "no answer" in safely([image(1.0)] * 3, triggers=[trigger(action=refuses)]).error
+    gate = threading.Event()
+    safely(endless(), lambda f: ten(image(1.0)), [trigger(action=lambda result: gate.wait(20))])
+    gate.set()
+
+
+def test_a_source_that_breaks_makes_safe():
+    def breaks():
+        yield image(0.1)
+        time.sleep(0.05)
+        raise OSError("cable pulled")
+
+    assert "cable pulled" in safely(breaks()).error
+
+
+def test_the_end_and_a_stop_make_safe_too_and_few_bad_frames_do_not():
+    safely([image(0.1)], ends="ended")
+    safely(endless(), ends="running", within_s=0.1)  # and then stopped
+    monitor = through([image(0.1), np.zeros((4, 4)), image(0.2)], safe=list, patience_s=20.0)
+    assert monitor.status().state == "ended" and monitor.status().failed == 1
+
+
+def test_what_is_safe_may_fail_and_is_told():
+    with Monitor([image(0.1)], ten, safe=lambda: 1 / 0) as monitor, pytest.raises(RuntimeError, match="ZeroDivision"):
+        monitor.wait(20)
+
+
+def test_an_evaluator_that_follows_is_given_the_time_and_says_how(tmp_path):
+    def follows(frame, t_s):
+        table = ten(frame)
+        table.attrs |= {"method": "joint" if t_s < 2 else "correlation", "note": "" if t_s < 2 else "too slow"}
+        return table
+
+    follows.follows = True
+    frames = [Frame(image(0.1), t) for t in (1.0, 2.0)]
+    monitor = through(frames, follows, log=tmp_path / "log")
+    assert monitor.status().method == "correlation"
+    log, _ = read_log(tmp_path / "log")
+    assert log["method"].tolist() == ["joint", "correlation"] and log["note"].tolist()[1] == "too slow"
 
 
 # -------------------- the log
@@ -798,6 +904,9 @@ def test_a_process_of_its_own_finds_the_same(few, calibration):
         (lambda: Monitor([], ten, ["w"]), TypeError, "triggers"),
         (lambda: Monitor([], ten, [trigger(), trigger()]), TypeError, "triggers"),
         (lambda: Monitor([], ten, window=1), ValueError, "window"),
+        (lambda: Monitor([], ten, safe=1), TypeError, "safe"),
+        (lambda: Monitor([], ten, safe=print, patience_s=0), ValueError, "patience_s"),
+        (lambda: OwnProcess(ten, niceness=20), ValueError, "niceness"),
         (lambda: Monitor([], ten, example=[1]), ValueError, "example"),
         (lambda: trigger(""), TypeError, "name"),
         (lambda: trigger(action=None), TypeError, "action"),

@@ -6,7 +6,11 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "monitor": ["Frame", "MiddleThird", "Monitor", "Result", "Status", "Trigger", "at_speed", "middle_thirds"],
+        "monitor": ["Monitor", "Result", "Status"],
+        "triggers": ["Fraction", "MiddleThird", "Trigger", "middle_thirds"],
+        "sources": ["FillingFolder", "Frame", "MicroManagerCamera", "at_speed"],
+        "actions": ["over_http", "over_serial"],
+        "following": ["Follower"],
         "device": ["Device", "Switched", "closed_loop", "switched", "timed", "true_fractions"],
         "own_process": ["OwnProcess"],
         "logbook": ["Logbook", "read_log"],

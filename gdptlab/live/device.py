@@ -19,8 +19,10 @@ from gdptlab._checks import choice, instance, instances, numbers, positive, whol
 from gdptlab.experiment.channel import Trajectories
 from gdptlab.experiment.film import Film
 from gdptlab.experiment.trigger import fractions, trigger_time
-from gdptlab.live.monitor import Frame, MiddleThird, Monitor, Result, Trigger
+from gdptlab.live.monitor import Monitor, Result
 from gdptlab.live.own_process import PROCESSES, follow_parent
+from gdptlab.live.sources import Frame
+from gdptlab.live.triggers import MiddleThird, Trigger
 
 SLOTS = 16
 """Number of frames that may wait to be grabbed; while all slots are full, the camera's frames are lost and counted.
@@ -292,6 +294,7 @@ def closed_loop(
     *,
     of: str = "w",
     level: float = 0.9,
+    sure: bool = False,
     linger_s: float = 0.2,
     log: str | os.PathLike[str] | None = None,
 ) -> dict[str, float]:
@@ -305,8 +308,9 @@ def closed_loop(
         As of a `Monitor`.
     of : str
         Middle third of the height, 'h', or of the width, 'w'.
-    level : float
-        Fraction at which the sound is switched off (paper: 0.9).
+    level, sure
+        As of a `Trigger`: the fraction at which the sound is switched off (paper: 0.9), and whether it must be sure.
+        The sound also goes off when the monitor fails.
     linger_s : float
         Time for which the experiment goes on afterwards.
     log : str or path-like, optional
@@ -330,9 +334,9 @@ def closed_loop(
         device.switch_off()
         off.set()
 
-    trigger = Trigger(name=of, fraction=middle, action=act, level=level)
+    trigger = Trigger(name=of, fraction=middle, action=act, level=level, sure=sure)
     device.run(film)
-    with Monitor(device, evaluate, [trigger], example=film[0], log=log) as monitor:
+    with Monitor(device, evaluate, [trigger], example=film[0], log=log, safe=device.switch_off) as monitor:
         if off.wait(len(film) / film.frame_rate_hz):
             sleep(linger_s)
         seen, status = monitor.recent(), monitor.status()

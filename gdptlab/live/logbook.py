@@ -173,8 +173,9 @@ def read_log(path: str | os.PathLike[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
     -------
     frames : DataFrame
         A row for each frame that was evaluated: `run` (a file may hold several, numbered from 0 in the order in which
-        they began), `frame`, `t_s`, `decision_s`, `done_s`, `dropped`, `count`, `error`, `action_error`, and for each
-        trigger `fraction_NAME` and `on_NAME` (see `monitor.Result`).
+        they began), `frame`, `t_s`, `decision_s`, `done_s`, `dropped`, `count`, `error`, `action_error`, `method` and
+        `note` where the evaluator gives them, and for each trigger `fraction_NAME`, `low_NAME`, `high_NAME` and
+        `on_NAME` (see `monitor.Result`).
     particles : DataFrame
         `run`, `frame` and the columns of the evaluator's table, rounded; empty if it was not logged.
 
@@ -197,7 +198,7 @@ def read_log(path: str | os.PathLike[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
             if "frame" not in line:
                 continue
             particles = line.pop("particles", None)
-            for name in ("fraction", "on"):
+            for name in ("fraction", "low", "high", "on"):
                 line |= {f"{name}_{trigger}": value for trigger, value in line.pop(name, {}).items()}
             rows.append({"run": run} | line)
             if particles:

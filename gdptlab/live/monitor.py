@@ -6,7 +6,9 @@ memory holds two or three frames however fast the camera is, and the frame evalu
 is overwritten before it was taken is dropped, and counted. `replay.watch` computes the same clock without waiting.
 
 No error of a frame stops the loop: the error is counted and logged, and the next frame is taken. An error that the
-loop cannot survive ends it in the state 'failed', which `status` shows and `wait` raises.
+loop cannot survive ends it in the state 'failed', which `status` shows and `wait` raises. Whoever switches something
+gives the monitor `safe`, such as "sound off": it is called when nobody watches any more, whatever the reason, and the
+monitor then also fails where it is blind for too long, or where an action fails.
 
 A thread shares Python's interpreter with the rest of the program, such as drawing. An evaluator wrapped in
 `OwnProcess` works in another process, and drawing delays it no more than a busy core would.
@@ -16,199 +18,27 @@ All times are those of `time.perf_counter`, which is one clock for all processes
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from threading import Condition, Event, Lock, Thread, current_thread
-from time import perf_counter, sleep
+from time import perf_counter
 from typing import Any, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, function, instance, instances, iterable, number, positive, rate, real_array, whole
+from gdptlab._checks import function, instances, positive, real_array, whole
 from gdptlab._checks import path as check_path
-from gdptlab.experiment.channel import Channel
-from gdptlab.experiment.trigger import in_middle_third
 from gdptlab.live.logbook import Logbook
 from gdptlab.live.own_process import as_text
+from gdptlab.live.sources import Frame
+from gdptlab.live.triggers import Trigger, as_fraction
 
 DIGITS = 3
 """Number of decimals of a particle's numbers in the log. Chosen: the least error measured is some 0.01 px. With 1,
 the log would add an error of its own; with all digits, it would be three times as long."""
-
-# -------------------- what goes in
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """A frame, and when the camera delivered it.
-
-    Attributes
-    ----------
-    image : array (rows, columns)
-    t_s : float
-        On the clock of `time.perf_counter`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the time is not a finite number.
-    """
-
-    image: ArrayLike
-    t_s: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "t_s", number("t_s", self.t_s))
-
-
-def at_speed(frames: Iterable[ArrayLike], rate_hz: float) -> Iterator[ArrayLike]:
-    """Yield frames at true speed: the first at once, frame i at i / rate_hz, none before its time.
-
-    Parameters
-    ----------
-    frames : iterable of arrays (rows, columns)
-        Such as a `Film`. A frame that is not ready in time comes late, and so may the frames after it.
-    rate_hz : float
-        Frames in a second.
-
-    Yields
-    ------
-    array (rows, columns)
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the rate is not a number above 0.
-    """
-    iterable("frames", frames)
-    period_s = 1 / rate("rate_hz", rate_hz)
-
-    def paced() -> Iterator[ArrayLike]:
-        """Sleep until the time of each frame (the check of the rate must not wait for the first)."""
-        start = perf_counter()
-        for i, frame in enumerate(frames):
-            sleep(max(start + i * period_s - perf_counter(), 0))
-            yield frame
-
-    return paced()
-
-
-@dataclass(frozen=True, kw_only=True)
-class MiddleThird:
-    """Fraction of the particles in the middle third of the channel's height or width: the paper's two triggers.
-
-    Attributes
-    ----------
-    of : str
-        'h' (|z| ≤ h/6) or 'w' (|y| ≤ w/6), as in `experiment.fractions`.
-    channel : Channel
-    to_channel : callable
-        Table of an evaluator -> the same with `y_channel_um` and `z_um`; for example `Film.to_channel`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a field is not of its kind.
-    """
-
-    of: str
-    channel: Channel
-    to_channel: Callable[[pd.DataFrame], pd.DataFrame]
-
-    def __post_init__(self) -> None:
-        choice("of", self.of, "hw")
-        instance("channel", self.channel, Channel)
-        function("to_channel", self.to_channel)
-
-    def __call__(self, table: pd.DataFrame) -> float:
-        """Return the fraction, from 0 to 1; NaN without particles."""
-        inside = in_middle_third(self.to_channel(table), self.of, self.channel)
-        return float(inside.mean()) if len(inside) else np.nan
-
-
-def middle_thirds(channel: Channel, to_channel: Callable[[pd.DataFrame], pd.DataFrame]) -> dict[str, MiddleThird]:
-    """Return the `MiddleThird` of height, 'h', and of width, 'w', which convert the table of a frame only once.
-
-    Parameters
-    ----------
-    channel, to_channel
-        As of `MiddleThird`.
-
-    Raises
-    ------
-    TypeError
-        If one is not of its kind.
-    """
-    function("to_channel", to_channel)
-    last: tuple[pd.DataFrame | None, pd.DataFrame | None] = (None, None)
-
-    def converted(table: pd.DataFrame) -> pd.DataFrame:
-        """Convert a table, unless it is the one converted last."""
-        nonlocal last
-        if table is not last[0]:
-            last = table, to_channel(table)
-        return last[1]
-
-    return {of: MiddleThird(of=of, channel=channel, to_channel=converted) for of in "hw"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trigger:
-    """When to act.
-
-    The trigger goes on with the first frame whose fraction is at or above `level`, and off again with the first whose
-    fraction is below `release`. Between the two, and in a frame with fewer than `least` particles, it does not change.
-
-    Attributes
-    ----------
-    name : str
-    fraction : callable
-        Table of the evaluator -> number, such as a `MiddleThird`. A NaN changes nothing.
-    action : callable
-        Called with the `Result` when the trigger goes on, in the evaluating thread: the next frame waits for it.
-    released : callable, optional
-        Called with the `Result` when the trigger goes off.
-    level : float
-        Fraction at which the trigger goes on (paper: 0.9).
-    release : float
-        Fraction below which the trigger goes off; at most `level`.
-    least : int
-        Smallest number of particles in a frame that may change the trigger.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a field is not of its kind or out of range.
-    """
-
-    name: str
-    fraction: Callable[[pd.DataFrame], float]
-    action: Callable[["Result"], object]
-    released: Callable[["Result"], object] | None = None
-    level: float = 0.9
-    release: float = 0.8
-    least: int = 5
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise TypeError(f"name: got {self.name!r}, allowed is a word")
-        for part in ("fraction", "action", "released"):
-            if part != "released" or self.released is not None:
-                function(part, getattr(self, part))
-        positive("level", self.level)
-        if positive("release", self.release, zero=True) > self.level:
-            raise ValueError(f"release: got {self.release:g}, allowed is up to level, {self.level:g}")
-        whole("least", self.least, 0, 2**31)
-
-    def after(self, on: bool, fraction: float, count: int) -> bool:
-        """Return whether the trigger is on after a frame, given whether it was on before."""
-        if count < self.least:
-            return on
-        return bool(fraction >= (self.release if on else self.level) or (on and np.isnan(fraction)))
-
 
 # -------------------- what comes out
 
@@ -228,8 +58,8 @@ class Result:
     image : array (rows, columns), or what else came
     table : DataFrame
         From the evaluator; without rows if there is an error.
-    fraction : dict
-        Of each trigger, by name; empty if there is an error.
+    fraction, low, high : dict
+        Of each trigger, by name, and the ends of its band (`triggers.Fraction`); empty if there is an error.
     on : dict
         Whether each trigger is on, by name.
     changed : tuple of str
@@ -245,6 +75,8 @@ class Result:
     image: Any
     table: pd.DataFrame
     fraction: dict[str, float]
+    low: dict[str, float]
+    high: dict[str, float]
     on: dict[str, bool]
     changed: tuple[str, ...] = ()
     error: str = ""
@@ -277,6 +109,8 @@ class Status:
         Since the last frame came, or the start.
     count : int
         Number of particles in the last frame that was evaluated.
+    method : str
+        How the evaluator says that it evaluated that frame; empty if it says nothing.
     fraction, on : dict
         Of each trigger, by name.
     actions_failed : int
@@ -301,6 +135,7 @@ class Status:
     latency_max_ms: float
     waiting_s: float
     count: int
+    method: str
     fraction: dict[str, float]
     on: dict[str, bool]
     actions_failed: int
@@ -324,10 +159,11 @@ class Monitor:
     source : object
         A camera with a method `grab`, or a function: it is called for one frame after the other, and waits until there
         is one (None: no more). Or an iterable of frames, such as `at_speed(film, 25)`. A frame is an array, whose
-        time is the moment at which it comes, or a `Frame`, which has a time of its own.
+        time is the moment at which it comes, or a `Frame`, which has a time of its own. Times must increase.
     evaluate : callable
         image -> DataFrame with a row for each particle: a `replay.Method`, `functools.partial(locate,
-        calibration=...)`, or an `OwnProcess` around one of these.
+        calibration=...)`, or an `OwnProcess` around one of these. A `Follower`, whose attribute `follows` is true, is
+        called with the frame's time, too.
     triggers : sequence of Trigger
     log : str or path-like, optional
         File to which a line is added for each frame evaluated (see `logbook`).
@@ -338,6 +174,13 @@ class Monitor:
         the first frame comes; and frames of another shape are refused. Without it the first frame sets the shape.
     window : int
         Number of last frames in rates, latencies and `recent`.
+    safe : callable, optional
+        Called once, without arguments, when the monitor fails, ends or is stopped: what is switched must be off when
+        nobody watches. With it the monitor fails where otherwise it would go on: where no frame could be evaluated
+        for `patience_s` (the camera is silent, its frames are refused, the evaluator or an action hangs), where the
+        source breaks, and where an action raises.
+    patience_s : float
+        For `safe`.
 
     Attributes
     ----------
@@ -360,29 +203,38 @@ class Monitor:
         log_particles: bool = True,
         example: ArrayLike | None = None,
         window: int = 1000,
+        safe: Callable[[], object] | None = None,
+        patience_s: float = 1.0,
     ) -> None:
         if not (callable(source) or callable(getattr(source, "grab", None)) or hasattr(source, "__iter__")):
             raise TypeError(f"source: got {source!r}, allowed is one with a method grab, a function, or an iterable")
         function("evaluate", evaluate)
+        if safe is not None:
+            function("safe", safe)
+        self._safe, self._patience_s = safe, positive("patience_s", patience_s)
         self._triggers = tuple(instances("triggers", triggers, Trigger))
         names = [trigger.name for trigger in self._triggers]
         if len(set(names)) < len(names):
             raise TypeError(f"triggers: got {names}, allowed are Triggers of different names")
         self._source, self._evaluate, self._log_particles = source, evaluate, log_particles
+        self._follows = bool(getattr(evaluate, "follows", False))
         self._example = None if example is None else real_array("example", example, 2)
         self._log_path, self._log = None if log is None else check_path("log", log), None
         self._shape = None if self._example is None else self._example.shape
         self._changed, self._stopping, self._finished = Condition(), Event(), Event()
         self._slot: tuple[int, Frame] | None = None
+        self._frame_s, self._good_s = -np.inf, np.nan  # times of the last frame, and of the last good result
         self._lock = Lock()  # of all below
         self._state, self._ended, self.started_s, self._last_s = "ready", False, np.nan, np.nan
         self._grabbed = self._evaluated = self._failed = self._dropped = self._actions_failed = 0
         self._error, self._latest = "", None
+        self._over = False
         self._fraction, self._on, self._count = {}, dict.fromkeys(names, False), 0
         window = whole("window", window, 2, 10**6)
         self._arrived: deque[float] = deque(maxlen=window)
         self._rows: deque[dict[str, Any]] = deque(maxlen=window)
-        self._threads = [Thread(target=run, name=run.__name__, daemon=True) for run in (self._grab, self._watch)]
+        runs = (self._grab, self._watch, self._guard)
+        self._threads = [Thread(target=run, name=run.__name__, daemon=True) for run in runs]
 
     def __enter__(self) -> Self:
         self.start()
@@ -411,6 +263,7 @@ class Monitor:
             self._close()
             raise RuntimeError(f"the example could not be evaluated: {as_text(error)}") from error
         self._state, self.started_s = "running", perf_counter()
+        self._good_s = self.started_s
         self._write({"event": "started", "utc": datetime.now(UTC).isoformat(), "t_s": self.started_s})
         for thread in self._threads:
             thread.start()
@@ -442,6 +295,7 @@ class Monitor:
         if self._state == "running":
             self._finished.wait(timeout_s)
             self._threads[0].join(0.2)  # it ends at once, unless its source waits
+            self._end("stopped")  # if the frame takes longer
         self._close()
 
     def _close(self) -> None:
@@ -483,6 +337,7 @@ class Monitor:
                 latency_max_ms=float(latency.max()),
                 waiting_s=perf_counter() - since,
                 count=self._count,
+                method="" if self._latest is None else self._latest.table.attrs.get("method", ""),
                 fraction=dict(self._fraction),
                 on=dict(self._on),
                 actions_failed=self._actions_failed,
@@ -516,6 +371,8 @@ class Monitor:
             with self._lock:
                 self._error = f"source: {as_text(error)}"
             self._write({"event": "source failed", "error": as_text(error), "t_s": perf_counter()})
+            if self._safe is not None:
+                self._end("failed", f"source: {as_text(error)}")
         finally:
             with self._changed:
                 self._ended = True
@@ -525,14 +382,36 @@ class Monitor:
         """Run the loop, and note whether the source, `stop` or an error ended it."""
         try:
             self._loop()
-            state, error = "stopped" if self._stopping.is_set() else "ended", ""
+            self._end("stopped" if self._stopping.is_set() else "ended")
         except BaseException as caught:
-            state, error = "failed", as_text(caught)
+            self._end("failed", as_text(caught))
+
+    def _guard(self) -> None:
+        """Fail when no frame could be evaluated for too long, if that is asked for."""
+        while self._safe is not None and not self._finished.wait(self._patience_s / 10):
+            if perf_counter() - self._good_s > self._patience_s:
+                self._end("failed", f"no frame could be evaluated for {self._patience_s:g} s; {self._error}")
+
+    def _end(self, state: str, error: str = "") -> None:
+        """Set the state at the end, switch to what is safe, and log it; only the first call counts."""
         with self._lock:
-            self._state, self._error = state, error or self._error
+            first, self._over = not self._over, True
+            if first:
+                self._state, self._error = state, error or self._error
+        if not first:
+            return
         self._stopping.set()  # nobody takes the frames that the source may still deliver
+        with self._changed:
+            self._changed.notify_all()
         try:
-            event = {"event": state, "grabbed": self._grabbed, "dropped": self._dropped, "t_s": perf_counter()}
+            if self._safe is not None:
+                self._safe()
+        except BaseException as caught:
+            error = f"{error}; safe: {as_text(caught)}".strip("; ")
+            with self._lock:
+                self._state, self._error = "failed", error
+        try:
+            event = {"event": self._state, "grabbed": self._grabbed, "dropped": self._dropped, "t_s": perf_counter()}
             self._write(event | ({"error": error} if error else {}))
         finally:
             self._finished.set()
@@ -548,20 +427,31 @@ class Monitor:
                 break
             number, frame = taken
             result = self._decided(number, frame, number - last - 1)
+            if self._over:
+                break  # it failed meanwhile, and made safe: nothing is switched any more
             last = number
-            self._noted(result, self._acted(result))
+            failures = self._acted(result)
+            self._noted(result, failures)
+            if failures and self._safe is not None:
+                self._end("failed", failures[0])
         with self._lock:
             self._dropped += taken is not None  # by a stop
 
     def _decided(self, number: int, frame: Frame, dropped: int) -> Result:
         """Evaluate a frame, and decide which triggers are on; any error becomes the result's."""
         try:
-            table = self._evaluate(self._checked(frame.image))
+            image = self._checked(frame.image)
+            if frame.t_s <= self._frame_s:
+                raise ValueError(
+                    f"frame: got the time {frame.t_s:g} s, allowed is later than {self._frame_s:g}, as before"
+                )
+            self._frame_s = frame.t_s
+            table = self._evaluate(image, frame.t_s) if self._follows else self._evaluate(image)
             if not isinstance(table, pd.DataFrame):
                 raise TypeError(f"evaluate: got a {type(table).__name__} from it, allowed is a DataFrame")
             if not table.columns.is_unique:
                 raise ValueError(f"evaluate: got columns {list(table)} from it, allowed are different names")
-            fraction = {t.name: float(t.fraction(table)) for t in self._triggers}
+            fraction = {t.name: as_fraction(t.fraction(table)) for t in self._triggers}
             on = {t.name: t.after(self._on[t.name], fraction[t.name], len(table)) for t in self._triggers}
             error = ""
         except BaseException as caught:  # sys.exit as well
@@ -573,7 +463,9 @@ class Monitor:
             dropped=dropped,
             image=frame.image,
             table=table,
-            fraction=fraction,
+            fraction={name: float(f) for name, f in fraction.items()},
+            low={name: f.low for name, f in fraction.items()},
+            high={name: f.high for name, f in fraction.items()},
             on=on,
             changed=tuple(name for name, value in on.items() if value != self._on[name]),
             error=error,
@@ -609,8 +501,10 @@ class Monitor:
         """Count the result and the errors of actions, keep them for `status` and `recent`, and log them."""
         done_s = perf_counter()
         plain = {"frame": result.frame, "dropped": result.dropped, "count": len(result.table), "error": result.error}
+        plain |= {name: result.table.attrs[name] for name in ("method", "note") if result.table.attrs.get(name)}
         row = {"t_s": result.t_s - self.started_s, "decision_s": result.decision_s - self.started_s}
-        by_name = {f"fraction_{name}": value for name, value in result.fraction.items()}
+        parts = {part: getattr(result, part) for part in ("fraction", "low", "high")}
+        by_name = {f"{part}_{name}": value for part, values in parts.items() for name, value in values.items()}
         by_name |= {f"on_{name}": value for name, value in result.on.items()}
         with self._lock:
             self._latest, self._on = result, result.on
@@ -618,11 +512,12 @@ class Monitor:
                 self._failed += 1
             else:
                 self._evaluated, self._count, self._fraction = self._evaluated + 1, len(result.table), result.fraction
+                self._good_s = done_s
             self._actions_failed += len(failures)
             self._error = (failures or [result.error or self._error])[-1]
             self._rows.append(plain | row | {"latency_ms": result.latency_ms} | by_name)
         line = plain | {"t_s": result.t_s, "decision_s": result.decision_s, "done_s": done_s}
-        line |= {"action_error": "; ".join(failures), "fraction": result.fraction, "on": result.on}
+        line |= {"action_error": "; ".join(failures), **parts, "on": result.on}
         if self._log_particles and len(result.table):
             columns = result.table.select_dtypes(["number", "bool"])
             line["particles"] = {name: columns[name].round(DIGITS).tolist() for name in columns}

@@ -16,7 +16,7 @@ from typing import Any, Self
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab._checks import positive
+from gdptlab._checks import positive, whole
 
 PROCESSES = multiprocessing.get_context("spawn")
 """How processes are started: afresh, on every system. A forked copy of this process could hold a lock for ever."""
@@ -41,15 +41,20 @@ class OwnProcess:
     timeout_s : float
         Longest time for one frame, but for the first, which may have to wait for machine code to be compiled.
 
+    niceness : int
+        By how much the process gives way to others, 0 to 19, as of `os.nice` (not on Windows). Drawing takes 19.
+
     Raises
     ------
     TypeError
         If `evaluate` is no function or cannot be pickled.
     ValueError
-        If the time is not above 0.
+        If the time is not above 0, or the niceness out of range.
     """
 
-    def __init__(self, evaluate: Callable[[NDArray], pd.DataFrame], *, timeout_s: float = 10.0) -> None:
+    def __init__(
+        self, evaluate: Callable[[NDArray], pd.DataFrame], *, timeout_s: float = 10.0, niceness: int = 0
+    ) -> None:
         if not callable(evaluate):
             raise TypeError(f"evaluate: got {evaluate!r}, allowed is a function")
         try:
@@ -59,7 +64,8 @@ class OwnProcess:
                 f"evaluate: got {evaluate!r}, which cannot be sent to another process ({as_text(error)}); allowed is a "
                 "function from a module, not from a notebook's cells"
             ) from error
-        self._timeout_s = positive("timeout_s", timeout_s)
+        self._timeout_s, self.follows = positive("timeout_s", timeout_s), getattr(evaluate, "follows", False)
+        self._niceness = whole("niceness", niceness, 0, 19)
         self._process, self._number, self._one_caller, self._answered = None, 0, RLock(), False
 
     def __enter__(self) -> Self:
@@ -81,7 +87,7 @@ class OwnProcess:
             if self._process is not None:
                 return
             self._connection, other = PROCESSES.Pipe()
-            self._process = PROCESSES.Process(target=_serve, args=(other,), daemon=True)
+            self._process = PROCESSES.Process(target=_serve, args=(other, self._niceness), daemon=True)
             self._process.start()
             other.close()  # so that this process notices the end of the other
             try:
@@ -90,8 +96,8 @@ class OwnProcess:
                 self.stop()
                 raise
 
-    def __call__(self, image: NDArray) -> pd.DataFrame:
-        """Evaluate a frame in the process.
+    def __call__(self, *frame: Any) -> pd.DataFrame:
+        """Evaluate a frame in the process: what is given here is what the function there is called with.
 
         Raises
         ------
@@ -100,7 +106,7 @@ class OwnProcess:
         """
         with self._one_caller:
             self.start()
-            table = self._answer(image, self._timeout_s if self._answered else max(START_S, self._timeout_s))
+            table = self._answer(frame, self._timeout_s if self._answered else max(START_S, self._timeout_s))
             self._answered = True
             return table
 
@@ -137,9 +143,11 @@ class OwnProcess:
                 self._process = None
 
 
-def _serve(connection: Any) -> None:
+def _serve(connection: Any, niceness: int) -> None:
     """Unpickle the evaluator in the first request through the connection, and evaluate the frames in all others."""
     follow_parent()
+    if niceness and hasattr(os, "nice"):
+        os.nice(niceness)
     evaluate = None
     with suppress(EOFError, OSError):
         while True:
@@ -149,7 +157,7 @@ def _serve(connection: Any) -> None:
                 if evaluate is None:
                     evaluate = pickle.loads(request)
                 else:
-                    table = evaluate(request)
+                    table = evaluate(*request)
             except Exception as raised:
                 error = as_text(raised)
             connection.send((number, error, table))
