@@ -11,6 +11,8 @@ from scipy.optimize import least_squares, lsq_linear
 from scipy.spatial import KDTree
 from scipy.stats import rankdata
 
+from gdptlab._checks import numbers
+
 Speed = Callable[[NDArray, NDArray, NDArray], ArrayLike]
 """Speed along x, in any unit, of the flow at x_px, y_px, z_um (n,)."""
 
@@ -22,10 +24,14 @@ LEAST_STEP = 1e-3
 """Least difference of neighbouring coefficients of the spline, as a fraction of the height: depths increase."""
 
 OUTLIER = 0.05
-"""Difference of a particle's move from the flow's, as a fraction of the fast ones' move, from which on it counts less."""
+"""Difference of a particle's move from the flow's, as a fraction of a fast one's move, from which on it counts less."""
 
-GROUPS = 5
+GROUPS = 10
 """Number of groups of consecutive frames, each of which is left out once to tell the error of the depths."""
+
+SCALE_OF_ONE = 0.447
+"""Standard deviation of the scale by the ranks of n evenly spread particles, times the root of n. Derived: half the
+root of the kurtosis, 1.8, less 1."""
 
 MOVED = (30.0, 2.0, 1.5)
 """Largest move of a particle from a frame to the next: along x, px; along y, px; along the
@@ -77,7 +83,12 @@ def depth_scale(table: pd.DataFrame, slices: NDArray, extent_um: tuple[float, fl
     )
     away = np.sqrt(GROUPS - 1) * (np.array(others) - np.mean(others, axis=0))
     slope = away @ (z_um - z_um.mean()) / ((z_um - z_um.mean()) ** 2).sum()
-    return Scale(z_um, np.sqrt((away**2).mean(axis=0)), float(np.sqrt((slope**2).mean())))
+    spread, std = np.sqrt((away**2).mean(axis=0)), float(np.sqrt((slope**2).mean()))
+    if speed is None:  # no less than that of ranks, and of their scale, if all particles are new in each frame
+        below = np.clip((z_um - extent_um[0]) / (extent_um[1] - extent_um[0]), 0, 1)
+        spread = np.maximum(spread, (extent_um[1] - extent_um[0]) * np.sqrt(below * (1 - below) / len(table)))
+        std = max(std, SCALE_OF_ONE / np.sqrt(len(table)))
+    return Scale(z_um, spread, std)
 
 
 def _basis(slices: NDArray, knots: NDArray) -> NDArray:
@@ -101,7 +112,7 @@ def _coefficients(
     moved, middle = x[second] - x[first], (x[first] + x[second]) / 2
 
     def shape(increments: NDArray) -> NDArray:
-        return np.asarray(speed(middle, y[first], basis[first] @ steps @ increments), dtype=float)
+        return _speeds(speed, middle, y[first], basis[first] @ steps @ increments)
 
     def residual(unknown: NDArray) -> NDArray:
         return moved - unknown[-1] * shape(unknown[:-1])
@@ -117,6 +128,16 @@ def _coefficients(
         f_scale=OUTLIER * np.percentile(np.abs(moved), 90),
     )
     return steps @ found.x[:-1]
+
+
+def _speeds(speed: Speed, x_px: NDArray, y_px: NDArray, z_um: NDArray) -> NDArray[np.float64]:
+    """What `speed` returns (n,), if it is a number for each place."""
+    values = numbers("speed", speed(x_px, y_px, z_um))
+    if values.shape != z_um.shape or not values.any():
+        raise ValueError(
+            f"speed: got values of shape {values.shape}, allowed is one for each of {len(z_um)} places, not all 0"
+        )
+    return values
 
 
 def _followed(table: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -4,8 +4,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.linalg import eigh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from gdptlab.pipeline.lone_images import BLUR_PX, LoneImages
 
@@ -22,6 +26,13 @@ images they hold 99 %, and hardly any noise."""
 NEAR, SUPPORT = 2.5, 2
 """Radius of a neighbourhood on the curve, in median distances of an image to the nearest of another particle; and the
 least number of particles in one. A neighbour spoils an image in a way of its own, so that spoilt images are alone."""
+
+SAME = (10, 0.1)
+"""Frames that were looked at, and distance of images on the sphere, within which images in near places may be of one
+particle. One that flows slowly is there for long, and its images say nothing new."""
+
+LEAST_NODES = 8
+"""Least number of neighbourhoods that make a curve."""
 
 REACH = 5.0
 """Width of the diffusion map's kernel, in radii of a neighbourhood."""
@@ -78,9 +89,24 @@ def _unit(points: NDArray) -> NDArray:
     return points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-30)
 
 
+def particles(table: pd.DataFrame, points: NDArray, size: int) -> NDArray[np.int64]:
+    """Number of the particle (n,) of each image: images that are alike, in near frames and near places, are of one."""
+    if not len(table):
+        return np.zeros(0, int)
+    step = table["frame"].rank(method="dense")
+    place = np.column_stack([table["x_px"] / (size / 2), table["y_px"] / (size / 4), step / SAME[0], points / SAME[1]])
+    a, b = KDTree(place).query_pairs(1.0, output_type="ndarray").T
+    return connected_components(coo_array((np.ones(len(a)), (a, b)), (len(table),) * 2))[1]
+
+
 def ordered(points: NDArray, particle: NDArray) -> Curve:
     """Order points (n, m) of the sphere, each of a particle (n,), along the curve that they lie on."""
     nodes, radius = _nodes(points, particle)
+    if len(nodes) < LEAST_NODES:
+        raise ValueError(
+            f"frames: got {len(points)} images that stand alone with {len(nodes)} places where several are alike, "
+            f"needed are {LEAST_NODES}: more images of one kind of particle, at all depths"
+        )
     distance = np.sqrt(np.maximum(2 - 2 * nodes @ nodes.T, 0))
     kernel = np.exp(-((distance / (REACH * radius)) ** 2))
     density = kernel.sum(axis=1)  # taken off: places where many images are do not bend the order

@@ -13,9 +13,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from gdptlab._checks import real_array
 from gdptlab.denoising import noise_level
@@ -62,7 +59,7 @@ class LoneImages:
     images : float32 array (n, size, size)
         Less the background, the particle's centre on the middle pixel.
     table : DataFrame
-        A row for each: `frame`, `x_px`, `y_px`, `particle` (images that follow each other in place are of one).
+        A row for each: `frame`, `x_px`, `y_px`.
     noise : float
         Standard deviation of the noise of a pixel of a frame.
     frames : int
@@ -100,7 +97,7 @@ def lone_images(frames: Sequence[ArrayLike], size: int | None = None) -> LoneIma
                 rows.append((k, region.x, region.y))
     table = pd.DataFrame(rows, columns=["frame", "x_px", "y_px"])
     images = np.stack(images) if images else np.zeros((0, size, size), np.float32)
-    return LoneImages(images, table.assign(particle=_particles(table, numbers, size)), noise, len(numbers))
+    return LoneImages(images, table, noise, len(numbers))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +165,7 @@ def _regions(frame: ArrayLike, noise: float) -> Iterator[_Region]:
 
 
 def _level(frame: NDArray[np.float32]) -> float:
-    """Background, the value that most pixels have: the shortest interval with half of them, of these half, and so on."""
+    """Background, the value that most pixels have: the shortest interval with half, of these half, and so on."""
     values = np.sort(frame[::2, ::2], axis=None)
     while len(values) > 10:
         half = len(values) // 2
@@ -189,13 +186,3 @@ def _centre(image: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
         if low - 2 * middle + high < 0:
             centre[axis] += 0.5 * (low - high) / (low - 2 * middle + high)
     return centre / 2, float(turned.max() / max((image**2).sum(), 1e-30))
-
-
-def _particles(table: pd.DataFrame, numbers: NDArray, size: int) -> NDArray[np.int64]:
-    """Number of the particle (n,) of each image: images in near frames and near places are of one."""
-    if not len(table):
-        return np.zeros(0, int)
-    step = np.searchsorted(numbers, table["frame"])
-    place = np.column_stack([table["x_px"] / (size / 2), table["y_px"] / (size / 4), step / 10])
-    a, b = KDTree(place).query_pairs(1.0, output_type="ndarray").T
-    return connected_components(coo_array((np.ones(len(a)), (a, b)), (len(table),) * 2))[1]

@@ -21,7 +21,7 @@ from gdptlab.calibration import Calibration
 from gdptlab.fit.pattern import image_size
 from gdptlab.locate import locate
 from gdptlab.pipeline.depth_scale import GROUPS, Speed, depth_scale
-from gdptlab.pipeline.image_curve import BEYOND, SLICES, features, first_stack, ordered
+from gdptlab.pipeline.image_curve import BEYOND, SLICES, features, first_stack, ordered, particles
 from gdptlab.pipeline.lone_images import LoneImages, lone_images
 
 LEAST_PARTICLES = 100
@@ -108,8 +108,10 @@ def calibrated(
     if size is not None and whole("size", size, 7, 10_001) % 2 == 0:
         raise ValueError(f"size: got {size}, allowed are odd numbers")
     lone = lone_images(frames, size)
-    _must_be_enough(lone)
-    curve = ordered(features(lone.images), lone.table["particle"].to_numpy())
+    points = features(lone.images) if len(lone.images) else np.zeros((0, 1))
+    particle = particles(lone.table, points, lone.images.shape[-1])
+    _must_be_enough(lone, len(np.unique(particle)))
+    curve = ordered(points, particle)
     stack = first_stack(lone, curve)
     wide_first = _sharpness(stack[BEYOND]) < _sharpness(stack[-1 - BEYOND])
     if wide_first != reverse:
@@ -139,7 +141,9 @@ def calibrated(
         made,
         learned=replace(model, own_error=error),
         report=FilmReport(
-            images=lone.table.assign(z_um=depth(BEYOND + (SLICES - 1) * curve.along), used=curve.used),
+            images=lone.table.assign(
+                particle=particle, z_um=depth(BEYOND + (SLICES - 1) * curve.along), used=curve.used
+            ),
             particles=table.assign(z_um=depth(table["slice"].to_numpy())).drop(columns="slice"),
             z_std_um=scale.z_std_um,
             scale_std=scale.std,
@@ -162,9 +166,8 @@ def _count(frames: Sequence[ArrayLike]) -> int:
     return len(frames)
 
 
-def _must_be_enough(lone: LoneImages) -> None:
+def _must_be_enough(lone: LoneImages, count: int) -> None:
     """Raise ValueError if too few particles stand alone, and say how many more frames it takes."""
-    count = lone.table["particle"].nunique()
     if count < LEAST_PARTICLES:
         more = f"about {int(np.ceil((LEAST_PARTICLES / max(count, 1) - 1) * lone.frames))} more" if count else "other"
         raise ValueError(
