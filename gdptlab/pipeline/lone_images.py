@@ -37,6 +37,9 @@ WIDE = 99
 """Percentile of the width of lone images that decides how large a piece is cut out. Wide images stand alone less often
 than others, and some of the widest are two particles that look symmetric."""
 
+ROOM = 1.25
+"""Size of a piece over that width: faint images show less of their width above the noise than bright ones."""
+
 SIZED_FRAMES = 25
 """Number of frames, evenly spread, in which the width is looked for."""
 
@@ -88,7 +91,7 @@ def lone_images(frames: Sequence[ArrayLike], size: int | None = None) -> LoneIma
     noise = noise or 1e-6 * float(np.ptp(np.asarray(frames[0])))
     if size is None:
         widths = [max(region.extent) for k in some for region in _regions(frames[k], noise)]
-        size = min(int(np.percentile(widths, WIDE) / 2) * 2 + 3, LARGEST) if widths else 3
+        size = min(int(ROOM * np.percentile(widths, WIDE) / 2) * 2 + 3, LARGEST) if widths else 3
     images, rows = [], []
     for k in numbers:
         for region in _regions(frames[k], noise):

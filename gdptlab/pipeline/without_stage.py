@@ -27,6 +27,9 @@ from gdptlab.pipeline.lone_images import LoneImages, lone_images
 LEAST_PARTICLES = 100
 """Least number of particles that stand alone: two or three for each slice."""
 
+OUTER = 5
+"""Slices at either end whose images tell the wide end."""
+
 INSIDE = 2
 """Slices from either end of the curve within which a sharpest image counts as at the end."""
 
@@ -113,8 +116,8 @@ def calibrated(
     _must_be_enough(lone, len(np.unique(particle)))
     curve = ordered(points, particle)
     stack = first_stack(lone, curve)
-    wide_first = _sharpness(stack[BEYOND]) < _sharpness(stack[-1 - BEYOND])
-    if wide_first != reverse:
+    pixels = _pixels(stack[BEYOND:-BEYOND])
+    if (pixels[:OUTER].mean() > pixels[-OUTER:].mean()) != reverse:
         stack, curve = stack[::-1], replace(curve, along=1 - curve.along)
     if size is None:
         trim = (stack.shape[1] - image_size(stack)) // 2
@@ -136,7 +139,7 @@ def calibrated(
     def depth(place: NDArray) -> NDArray:
         return np.interp(place, places[kept], scale.z_um)
 
-    sharpest = int(_sharpness(stack).argmax())
+    sharpest = int(_pixels(stack).argmin())
     return replace(
         made,
         learned=replace(model, own_error=error),
@@ -177,7 +180,7 @@ def _must_be_enough(lone: LoneImages, count: int) -> None:
         )
 
 
-def _sharpness(images: NDArray) -> NDArray:
-    """Concentration (...,) of the light of images (..., s, s) in few pixels."""
-    square = images.astype(float) ** 2
-    return (square**2).sum(axis=(-2, -1)) / square.sum(axis=(-2, -1)) ** 2
+def _pixels(images: NDArray) -> NDArray:
+    """Number of pixels (n,) over which the light of images (n, s, s) is spread."""
+    light = np.abs(images.astype(float))
+    return light.sum(axis=(1, 2)) ** 2 / (light**2).sum(axis=(1, 2))
