@@ -26,6 +26,10 @@ LEAST_STEP = 1e-3
 OUTLIER = 0.05
 """Difference of a particle's move from the flow's, as a fraction of a fast one's move, from which on it counts less."""
 
+PRIOR = 0.4
+"""Weight of the depths by ranks beside the speed: a coefficient off by the height counts as a particle whose move is off
+by this fraction of a fast one's. It decides only beyond the last particles, where nothing else does."""
+
 GROUPS = 10
 """Number of groups of consecutive frames, each of which is left out once to tell the error of the depths."""
 
@@ -114,8 +118,11 @@ def _coefficients(
     def shape(increments: NDArray) -> NDArray:
         return _speeds(speed, middle, y[first], basis[first] @ steps @ increments)
 
+    usual = np.percentile(np.abs(moved), 90)
+
     def residual(unknown: NDArray) -> NDArray:
-        return moved - unknown[-1] * shape(unknown[:-1])
+        away = steps @ (unknown[:-1] - start) / (high - low)
+        return np.concatenate([moved - unknown[-1] * shape(unknown[:-1]), PRIOR * usual * away])
 
     expected = shape(start)
     factor = (expected @ moved) / (expected @ expected)
@@ -125,7 +132,7 @@ def _coefficients(
         bounds=([*least, -np.inf], np.inf),
         x_scale=[high - low] * len(start) + [abs(factor)],
         loss="soft_l1",
-        f_scale=OUTLIER * np.percentile(np.abs(moved), 90),
+        f_scale=OUTLIER * usual,
     )
     return steps @ found.x[:-1]
 
