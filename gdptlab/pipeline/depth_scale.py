@@ -27,8 +27,8 @@ OUTLIER = 0.05
 """Difference of a particle's move from the flow's, as a fraction of a fast one's move, from which on it counts less."""
 
 PRIOR = 0.4
-"""Weight of the depths by ranks beside the speed: a coefficient off by the height counts as a particle whose move is off
-by this fraction of a fast one's. It decides only beyond the last particles, where nothing else does."""
+"""Weight of the depths by ranks beside the speed: a coefficient off by the height counts as a particle whose move is
+off by this fraction of a fast one's. It decides only beyond the last particles, where nothing else does."""
 
 GROUPS = 10
 """Number of groups of consecutive frames, each of which is left out once to tell the error of the depths."""
