@@ -55,6 +55,17 @@ def test_depths_come_without_any_depth(made):
     assert np.sqrt((pairs["dz_um"] ** 2).mean()) < 3 * np.median(calibration.report.z_std_um)
 
 
+def test_other_frames_are_explained_as_well(made):
+    frames, truth, calibration = made
+    others = np.setdiff1d(np.arange(len(frames)), calibration.report.particles["frame"])[:6]
+    table = pd.concat([locate(frames[k], calibration, method="joint").assign(frame=k) for k in others])
+    inside = truth[
+        truth["frame"].isin(others) & truth[["x_px", "y_px"]].clip(5, 145).eq(truth[["x_px", "y_px"]]).all(axis=1)
+    ]
+    pairs = match(table.reset_index(drop=True), inside, within_um=HEIGHT_UM)
+    assert len(pairs) >= 0.95 * len(inside) and (table["chi2"] < 2).mean() > 0.95
+
+
 def test_the_error_of_the_scale_is_in_every_depth(made, tmp_path):
     frames, _, calibration = made
     known = calibration.model.own_error[:, 2]

@@ -133,8 +133,10 @@ def calibrated(
     kept = (places >= np.floor(table["slice"].min())) & (places <= np.ceil(table["slice"].max()))
     scale = depth_scale(table, places[kept], (-room, room), speed)
     made = Calibration.from_stack(stack[kept], scale.z_um)
-    model = made.model
-    error = np.column_stack([model.own_error[:, :2], np.hypot(model.own_error[:, 2], scale.z_std_um)])
+    # Along the curve slices are even, in depth they are not: the model is smoothed along the curve.
+    model, step_um = Calibration.from_stack(stack[kept], places[kept]).model, np.gradient(scale.z_um)
+    error = np.column_stack([model.own_error[:, :2], np.hypot(model.own_error[:, 2] * step_um, scale.z_std_um)])
+    model = replace(model, z_um=scale.z_um, own_error=error, own_bias_um=model.own_bias_um * step_um)
 
     def depth(place: NDArray) -> NDArray:
         return np.interp(place, places[kept], scale.z_um)
@@ -142,7 +144,7 @@ def calibrated(
     sharpest = int(_pixels(stack).argmin())
     return replace(
         made,
-        learned=replace(model, own_error=error),
+        learned=model,
         report=FilmReport(
             images=lone.table.assign(
                 particle=particle, z_um=depth(BEYOND + (SLICES - 1) * curve.along), used=curve.used
