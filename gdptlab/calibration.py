@@ -5,6 +5,7 @@ templates that a frame is correlated with, and the map of expected C_m profiles 
 """
 
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
@@ -30,7 +31,7 @@ LOSSLESS = 0.98
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Calibration stack, templates, subset and map. Made by `from_stack`, `from_bead`, `from_scan` or `load`.
+    """Calibration stack, templates, subset and map. Made by one of `from_...`, or `load`.
 
     Attributes
     ----------
@@ -44,8 +45,8 @@ class Calibration:
         The stack, denoised, each image with mean 0 and norm 1.
     learned : PatternModel, optional
         Patterns that `from_scan` learned from all beads of a scan at once, which the joint fit then draws with.
-    report : ScanReport, optional
-        How `from_scan` came to this calibration.
+    report : ScanReport or FilmReport, optional
+        How `from_scan` or `from_film` came to this calibration.
     depth_factor : float
         Depth in the sample over travel of the stage that `z_um` contains (`with_depth_factor`); 1 if it is as given.
     camera : Preparation, optional
@@ -175,8 +176,7 @@ class Calibration:
                 own_bias_um=self.learned.own_bias_um * ratio,
             )
         if self.report is not None:
-            beads = self.report.beads
-            changes["report"] = replace(self.report, beads=beads.assign(offset_um=beads["offset_um"] * ratio))
+            changes["report"] = self.report.scaled(ratio)
         return replace(self, **changes)
 
     def one_side(self, side: str) -> Self:
@@ -223,8 +223,7 @@ class Calibration:
                 **{name: getattr(model, name)[part] for name in ("z_um", "pattern_error", "own_error", "own_bias_um")},
             )
         if self.report is not None:
-            of_slices = {name: getattr(self.report, name)[part] for name in ("drift_px", "clipped")}
-            changes["report"] = replace(self.report, **of_slices)
+            changes["report"] = self.report.part(part)
         return replace(self, **changes)
 
     @classmethod
@@ -334,6 +333,73 @@ class Calibration:
         order = np.argsort(z_um)
         model, _ = learned(np.asarray(scan)[order], calibration.z_um, beads, size=size, field=field, modes=modes)
         return replace(calibration, learned=model)
+
+    @classmethod
+    def from_film(
+        cls,
+        frames: Sequence[ArrayLike],
+        *,
+        height_um: float,
+        radius_um: float = 0.0,
+        speed: Callable[[NDArray, NDArray, NDArray], ArrayLike] | None = None,
+        reverse: bool = False,
+        size: int | None = None,
+        fitted: int = 50,
+        prepare: Preparation | None = None,
+    ) -> Self:
+        """Calibrate without a scan, with a film of particles of one kind whose depths nobody knows.
+
+        Images that stand alone are ordered along the curve on which they lie, as they differ by depth alone. Then all
+        particles in some frames are measured, and their places on the curve become depths, from -height_um / 2 to
+        height_um / 2 about the middle of the channel, by what is known:
+
+        * Particles are evenly spread over the height (before a force acts on them). Frames must lie so far apart in
+          time that the flow brings new particles. The error falls with the root of their number.
+        * Or, with `speed`, the profile of the flow: particles are followed from a frame to the next, which must come so
+          soon that they move by less than half a template. They need not be evenly spread.
+
+        Which end is the near one no film tells: z increases towards the end with the wider images, unless `reverse`.
+
+        Parameters
+        ----------
+        frames : sequence of arrays (rows, columns)
+            A film that can be asked for any frame: an array, a list, `open_images`. The background must be level
+            (`prepare`). 100 particles at least must stand alone somewhere.
+        height_um : float
+            Height of the channel, or of the layer that the particles fill.
+        radius_um : float
+            Distance that the centres of the particles keep from either wall.
+        speed : callable, optional
+            speed(x_px, y_px, z_um): how fast the flow is along x, in any unit; arrays (n,) in and out.
+        reverse : bool
+            Let z increase towards the end with the narrower images.
+        size : int, optional
+            Rows and columns of a template, odd; just enough for the widest image if not given.
+        fitted : int
+            Number of frames in which all particles are measured.
+        prepare : Preparation, optional
+            What is done to the frames first; its dark and flat image are remembered (`camera`).
+
+        Returns
+        -------
+        Calibration
+            Its attribute `report` says how the depths were found, and how far they are known; `z_std_um` of the joint
+            fit contains the error of the depths.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not of that form, too few particles stand alone, or no depths follow.
+        """
+        from gdptlab.pipeline.without_stage import calibrated
+
+        camera = None
+        if prepare is not None:
+            camera, frames = preparation(prepare).camera, preparation(prepare)(frames)
+        made = calibrated(
+            frames, height_um, radius_um=radius_um, speed=speed, reverse=reverse, size=size, fitted=fitted
+        )
+        return replace(made, camera=camera)
 
     def __len__(self) -> int:
         return len(self.stack)

@@ -306,6 +306,7 @@ NOT_CALLED = {
     "fit.Explained": "returned, not made by users",
     "fit.Joint": "of the fit, whose door is `explained`",
     "fit.PatternModel": "made by `learned`",
+    "pipeline.FilmReport": "returned",
     "pipeline.Images": "made by `open_images`",
     "pipeline.Measured": "returned",
     "pipeline.ScanReport": "returned",

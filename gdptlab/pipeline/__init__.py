@@ -14,6 +14,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "measuring": ["Measured", "measure"],
         "stream": ["batch_to_parquet"],
         "surface": ["flattened"],
+        "without_stage": ["FilmReport"],
         "tables": ["in_um", "save_points", "save_table"],
     },
 )

@@ -10,6 +10,7 @@ bead are told from neighbours by their distance and direction, which are the sam
 """
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -150,6 +151,14 @@ class ScanReport:
     settings: pd.DataFrame
     overview: NDArray[np.float32]
     noise: float
+
+    def scaled(self, ratio: float) -> Self:
+        """Return the report with depths times a ratio."""
+        return replace(self, beads=self.beads.assign(offset_um=self.beads["offset_um"] * ratio))
+
+    def part(self, part: slice) -> Self:
+        """Return the report on some of the slices."""
+        return replace(self, drift_px=self.drift_px[part], clipped=self.clipped[part])
 
 
 def find_beads(scan: ArrayLike, z_um: ArrayLike) -> pd.DataFrame:

@@ -10,6 +10,7 @@ from gdptlab._checks import LARGEST, positive
 from gdptlab.calibration import Calibration, checked
 from gdptlab.denoising import noise_level, signal_to_noise
 from gdptlab.fit.bounds import expected_error
+from gdptlab.pipeline.without_stage import FilmReport
 
 AMBIGUOUS = 0.95
 """Correlation from which on the images of two depths are mistaken for each other. Chosen between 0.9 and 0.99 on the
@@ -50,6 +51,10 @@ JUMP = 0.1
 """Drift from a slice to the next, as a fraction of a template, above which a spot that jumped is taken for no bead.
 Derived: the planar beads drift by a thousandth of a template from slice to slice; a tenth leaves room for coarse
 stages, and spots of two beads that are taken for one jump by more."""
+
+KINDS = (0.03, 0.1)
+"""Fractions of the particles that images of one kind do not explain above which a calibration from a film is looked at,
+and is bad. Chosen on the channel's films: 0.001 to 0.004 with one kind, 0.4 with two kinds, 5 and 3 um."""
 
 
 class Judgement(NamedTuple):
@@ -117,7 +122,8 @@ def report(calibration: Calibration) -> pd.DataFrame:
     Parameters
     ----------
     calibration : Calibration
-        However it was made. Of one from `Calibration.from_scan` the beads are judged as well.
+        However it was made. Of one from `Calibration.from_scan` the beads are judged as well, of one from `from_film`
+        the scale of its depths.
 
     Returns
     -------
@@ -130,7 +136,9 @@ def report(calibration: Calibration) -> pd.DataFrame:
     span = float(calibration.z_um[-1] - calibration.z_um[0])
     error_um = np.hypot(depths["z_std_um"], depths["own_error_um"])
     judgements = [_signal(depths), _step(depths), _ambiguity(depths), _error(error_um, span), _own_noise(depths)]
-    if made:
+    if isinstance(made, FilmReport):
+        judgements += [_scale(made, span), _sides(made), _kinds(made)]
+    elif made:
         judgements += [
             _beads(made.beads),
             _clipping(made.clipped, calibration.subset),
@@ -219,6 +227,33 @@ def _plane(beads: pd.DataFrame, z_um: NDArray, error_um: float) -> Judgement:
     advice = "The field is curved or tilted, which goes into z unless it is corrected (`flattened`, or field=True)."
     look = uneven > max(step / 2, error_um)
     return Judgement("the plane of beads", bool(uneven > UNEVEN * span), look, finding, advice)
+
+
+def _scale(made: FilmReport, span: float) -> Judgement:
+    """Whether a film's depths are known well, over the range of depths, um."""
+    worst = float(made.z_std_um.max()) / span
+    finding = (
+        f"by the {made.scaled_by}: to {100 * made.scale_std:.1f} %, a depth to {made.z_std_um.max():.2g} µm or less"
+    )
+    advice = "More frames to measure (`fitted`), with new particles in each. The sign is not known: see `reverse`."
+    return Judgement("scale of depth", worst > ERROR[1], worst > ERROR[0], finding, advice)
+
+
+def _sides(made: FilmReport) -> Judgement:
+    """Whether a film's images tell the two sides of focus apart."""
+    finding = f"the sharpest image lies {'inside' if made.focus_inside else 'at an end of'} the range of depths"
+    advice = (
+        "Either all particles lie on one side of focus, or images of both sides look alike and were taken for one "
+        "another: then depths are distances from focus, and wrong. A film cannot tell which."
+    )
+    return Judgement("sides of focus", False, not made.focus_inside, finding, advice)
+
+
+def _kinds(made: FilmReport) -> Judgement:
+    """Whether a film shows one kind of particle."""
+    finding = f"{100 * made.misfits:.1f} % of the particles are not explained by images of one kind"
+    advice = "Two kinds of particle, or sizes that differ: their images lie on no curve. Use a suspension of one kind."
+    return Judgement("one kind", made.misfits > KINDS[1], made.misfits > KINDS[0], finding, advice)
 
 
 def _drift(drift_px: NDArray, size: int) -> Judgement:
