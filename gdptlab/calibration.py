@@ -179,6 +179,23 @@ class Calibration:
             changes["report"] = self.report.scaled(ratio)
         return replace(self, **changes)
 
+    def with_depth_error(self, std_um: float) -> Self:
+        """Return the calibration with a further error of z, which is in every `z_std_um` measured with it.
+
+        Parameters
+        ----------
+        std_um : float
+            Standard deviation, at any depth: such as what frames that the calibration does not fit quite may stand for
+            (`fit.mismatch_error_um`).
+
+        Raises
+        ------
+        TypeError, ValueError
+            If it is no number, or below 0.
+        """
+        own_error = np.hypot(self.model.own_error, (0, 0, positive("std_um", std_um, zero=True)))
+        return replace(self, learned=replace(self.model, own_error=own_error))
+
     def one_side(self, side: str) -> Self:
         """Return the part of the calibration on one side of focus, where images of both sides look alike.
 

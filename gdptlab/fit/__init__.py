@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "frames": ["explained"],
         "joint": ["Explained", "Joint"],
         "learning": ["learned"],
+        "mismatch": ["mismatch_error_um", "pattern_mismatch"],
         "model": ["PatternModel", "field_terms"],
         "pattern": ["particle_light"],
         "plane": ["decided_by_plane"],

@@ -16,12 +16,13 @@ from gdptlab._checks import flag, number, positive, whole
 from gdptlab._checks import path as check_path
 from gdptlab._files import keep_arrays, kept_arrays, sources_folder, written_whole
 from gdptlab.calibration import Calibration
+from gdptlab.fit.mismatch import mismatch_error_um, pattern_mismatch
 from gdptlab.pipeline.beads import ScanReport
 from gdptlab.pipeline.errors import with_errors
 from gdptlab.pipeline.images import Images, open_images, open_scan
 from gdptlab.pipeline.page import write_page
 from gdptlab.pipeline.quality import report
-from gdptlab.pipeline.settings import Settings, choose_settings
+from gdptlab.pipeline.settings import Settings, choose_settings, spread
 from gdptlab.pipeline.stream import batch_to_parquet
 from gdptlab.pipeline.surface import flattened
 from gdptlab.pipeline.tables import about, as_json, in_um, save_points, save_table
@@ -41,6 +42,8 @@ DEPTH = 0.1
 """Search range along z, if none is given, as a fraction of the range of depths. As the largest error of z of a pair in
 `match`: what is farther off is another particle."""
 
+COMPARED = 5
+"""Number of frames whose particles are compared with the calibration's. Convention: with 40 in each, 200 in all."""
 
 CELLS = (8, 8, 3)
 """Cells along x, y and z of the mean velocity field, if none are given. Chosen: of a few thousand rows, each then holds
@@ -184,9 +187,13 @@ def measure(
         calibration = calibration.with_depth_factor(depth_factor)
     if side is not None:
         calibration = calibration.one_side(side)
-    quality = report(calibration)
     settings = choose_settings(frames_used, calibration, **{k: v for k, v in choices.items() if k in OF_FRAMES})
-    n_jobs = 1 if settings.arguments["method"] == "joint" else n_jobs
+    quality = report(calibration)
+    if settings.arguments["method"] == "joint":
+        n_jobs, mismatch = 1, pattern_mismatch(spread(frames_used, COMPARED), calibration)
+        quality = report(calibration, mismatch)
+        if error_um := mismatch_error_um(mismatch):
+            calibration = calibration.with_depth_error(error_um)
     parts = batch_to_parquet(
         film,
         calibration,

@@ -10,6 +10,7 @@ from gdptlab._checks import LARGEST, positive
 from gdptlab.calibration import Calibration, checked
 from gdptlab.denoising import noise_level, signal_to_noise
 from gdptlab.fit.bounds import expected_error
+from gdptlab.fit.mismatch import mismatch_error_um
 from gdptlab.pipeline.without_stage import FilmReport
 
 AMBIGUOUS = 0.95
@@ -116,14 +117,19 @@ def _ambiguous(correlation: NDArray, k: int) -> int:
     return best
 
 
-def report(calibration: Calibration) -> pd.DataFrame:
+def report(calibration: Calibration, mismatch: pd.DataFrame | None = None) -> pd.DataFrame:
     """Say what is good and what is not about a calibration.
+
+    A focus that moved since the scan shifts all z alike, which neither the calibration nor a film shows. A bead that
+    sticks to a wall does: its z must be that of the wall, and stay.
 
     Parameters
     ----------
     calibration : Calibration
         However it was made. Of one from `Calibration.from_scan` the beads are judged as well, of one from `from_film`
         the scale of its depths.
+    mismatch : DataFrame, optional
+        From `fit.pattern_mismatch`, of some frames of a film: whether their particles look as the calibration's.
 
     Returns
     -------
@@ -145,6 +151,8 @@ def report(calibration: Calibration) -> pd.DataFrame:
             _plane(made.beads, calibration.z_um, float(error_um.median())),
             _drift(made.drift_px, calibration.size),
         ]
+    if mismatch is not None:
+        judgements.append(_mismatch(mismatch, span))
     verdicts = ["bad" if each.bad else "look" if each.look else "good" for each in judgements]
     advice = ["" if v == "good" else each.advice for each, v in zip(judgements, verdicts, strict=True)]
     return pd.DataFrame(
@@ -265,6 +273,21 @@ def _drift(drift_px: NDArray, size: int) -> Judgement:
     if jumps:
         advice = "No stage jumps like that: a spot is no bead, or has a neighbour. Choose other beads (`beads_px`)."
     return Judgement("drift", jumps or drift > DRIFT * size, drift > 1, finding, advice)
+
+
+def _mismatch(mismatch: pd.DataFrame, span: float) -> Judgement:
+    """Whether the mean image of a film's particles is the calibration's, of `span` µm."""
+    error_um, known = mismatch_error_um(mismatch), mismatch.dropna()
+    finding = f"{mismatch['n'].sum()} particles are too few to compare"
+    if len(known):
+        finding = (
+            f"mean images of {known['n'].sum()} particles differ by {_from_to(100 * known['mismatch'], '.1f')} %, by "
+            f"{_from_to(100 * known['own'], '.1f')} % with the calibration's noise alone"
+        )
+    finding += f"; this may stand for {error_um:.2g} µm of z" if error_um else ""
+    finding += "; a focus that moved, which shifts all z alike, cannot be seen"
+    advice = "The optics changed since the scan: scan again, or carry the error along (`with_depth_error`)."
+    return Judgement("the film's images", error_um > ERROR[1] * span, error_um > 0, finding, advice)
 
 
 def _from_to(values: pd.Series, form: str) -> str:

@@ -130,7 +130,7 @@ def choose_settings(
     given = {name: value for name, value in given.items() if value is not None}
     _must_go_together(method, given)
     whole("looked_at", looked_at, 1, 10_000)
-    looked = [image_array("image", frame, 2) for frame in _spread(frames, looked_at)]
+    looked = [image_array("image", frame, 2) for frame in spread(frames, looked_at)]
     if not looked:
         raise ValueError("frames: got none, needed is one or more")
     others = {name: value for name, value in given.items() if name != "threshold"}
@@ -157,7 +157,7 @@ def choose_settings(
     return Settings(arguments, table, threshold, found, false, side_lobes)
 
 
-def _spread(frames: Iterable[ArrayLike], n: int) -> list[ArrayLike]:
+def spread(frames: Iterable[ArrayLike], n: int) -> list[ArrayLike]:
     """Up to `n` frames (rows, columns), evenly spread over a sequence, the first of anything else."""
     sequence = hasattr(frames, "__len__") and hasattr(frames, "__getitem__") and not isinstance(frames, dict)
     if sequence and getattr(frames, "ndim", 1):
