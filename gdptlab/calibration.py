@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from gdptlab._checks import choice, depths, flag, image_array, instance, positive, whole
@@ -417,6 +418,42 @@ class Calibration:
             frames, height_um, radius_um=radius_um, speed=speed, reverse=reverse, size=size, fitted=fitted
         )
         return replace(made, camera=camera)
+
+    @classmethod
+    def from_labelled(
+        cls, frames: ArrayLike, table: pd.DataFrame, *, size: int | None = None, n_sub: int | None = None
+    ) -> Self:
+        """Calibrate without a scan, with particles of known position and depth; some may overlap.
+
+        Labels may come from a simulation, a second camera, particles on the floor and the ceiling, or from hand. All
+        frames together are explained by one image for each depth, smooth in z, and an amplitude for each particle.
+        Errors of x and y are corrected; depths are taken as they are. A sign of z that is wrong in all labels alike
+        turns the calibration over, which no image can tell.
+
+        Parameters
+        ----------
+        frames : array (F, rows, columns)
+        table : DataFrame
+            Columns `frame` (from 0; not needed if there is one frame), `x_px`, `y_px` (the first pixel's centre is
+            (0, 0)) and `z_um`: nearly all particles of the frames.
+        size : int, optional
+            Rows and columns of the images, odd. If not given, enough for the widest.
+        n_sub : int, optional
+            As in `from_scan`.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not of that form; if there are too few particles, or labels do not fit the images: the
+            message says in which way, if another one fits.
+        """
+        from gdptlab.pipeline.labels import calibration_of_labels
+
+        return calibration_of_labels(frames, table, size=size, n_sub=n_sub)
 
     def __len__(self) -> int:
         return len(self.stack)

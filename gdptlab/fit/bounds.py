@@ -59,7 +59,7 @@ def own_error(calibration: Calibration) -> NDArray[np.float64]:
         RMS error of x, y (px) and z (µm).
     """
     light = particle_light(calibration)
-    rows = np.linalg.pinv(_derivatives(light, calibration.z_um))[:, :3]
+    rows = np.linalg.pinv(derivatives(light, calibration.z_um))[:, :3]
     errors = recalibration_errors(calibration).reshape(REPEATS, *light.shape[:1], -1, 1)
     mean_square = np.mean(np.square(rows @ errors), axis=0)[..., 0]
     return np.sqrt(uniform_filter1d(mean_square, SMOOTHED, axis=0, mode="nearest"))
@@ -77,7 +77,7 @@ def own_bias_um(calibration: Calibration) -> NDArray[np.float64]:
     """
     light, off = particle_light(calibration), []
     for error in recalibration_errors(calibration):
-        rows = np.linalg.pinv(_derivatives(light + error, calibration.z_um))[:, 2:3]
+        rows = np.linalg.pinv(derivatives(light + error, calibration.z_um))[:, 2:3]
         off.append(-rows @ error.reshape(len(light), -1, 1))
     return uniform_filter1d(np.mean(off, axis=0)[:, 0, 0], SMOOTHED, mode="nearest")
 
@@ -128,11 +128,11 @@ def expected_error(
     else:
         variance += amplitude * np.abs(light) / positive("electrons_per_count", electrons_per_count)
     weight = (amplitude**2 / np.maximum(variance, LEAST_NOISE**2)).reshape(len(light), -1, 1)
-    columns = _derivatives(light, calibration.z_um)
+    columns = derivatives(light, calibration.z_um)
     fisher = columns.transpose(0, 2, 1) @ (weight * columns)
     noisy = np.zeros_like(fisher)
     for error in recalibration_errors(calibration):
-        off = _derivatives(light + error, calibration.z_um) - columns
+        off = derivatives(light + error, calibration.z_um) - columns
         noisy += off.transpose(0, 2, 1) @ (weight * off) / REPEATS
     variances = map(_without_noise, fisher, uniform_filter1d(noisy, 3, axis=0, mode="nearest"))
     names = ("x_std_px", "y_std_px", "z_std_um")
@@ -150,7 +150,7 @@ def _without_noise(fisher: NDArray[np.float64], noise: NDArray[np.float64]) -> N
     return basis**2 @ (1 / (1 - np.minimum(fractions, MOST_NOISE)))
 
 
-def _derivatives(images: NDArray, z_um: NDArray) -> NDArray[np.float64]:
+def derivatives(images: NDArray, z_um: NDArray) -> NDArray[np.float64]:
     """How each image changes with x, y, z, amplitude and background: (N, n * n, 5).
 
     Slopes in the image are those of the cubic spline through its pixels: differences of pixels would make them smaller

@@ -209,7 +209,7 @@ def averaged_beads(
         stack = _fitting(stack, scan, z_um, beads)
     calibration = Calibration.from_stack(stack, z_um, n_sub=n_sub or min(9, len(scan)))
     if n_sub is None:
-        calibration = calibration.with_subset(_subset_size(calibration))
+        calibration = calibration.with_subset(subset_size(calibration))
     settings = _choices(
         calibration, beads, widest, {"beads": given, "size": size is not None, "n_sub": n_sub is not None}
     )
@@ -526,7 +526,7 @@ def _clipped(scan: NDArray, beads: pd.DataFrame, size: int) -> NDArray[np.bool_]
     return np.array([_window(at_end, b.x_px, b.y_px, size // 2)[0].any(axis=(1, 2)) for b in beads.itertuples()])
 
 
-def _subset_size(calibration: Calibration) -> int:
+def subset_size(calibration: Calibration) -> int:
     """Fewest images of which, at any depth, one correlates by `COVERED` or more; of `SUBSETS`."""
     correlation = calibration.self_similarity()
     least, most = (min(n, len(calibration)) for n in SUBSETS)
