@@ -17,8 +17,8 @@ Speed = Callable[[NDArray, NDArray, NDArray], ArrayLike]
 """Speed along x, in any unit, of the flow at x_px, y_px, z_um (n,)."""
 
 KNOTS = 6
-"""Number of inner knots of the cubic spline from places to depths. Chosen: true depths of the channel's films then
-follow from places to 0.1 um."""
+"""Number of inner knots of the cubic spline from places to depths. Measured on two of the channel's films, on true
+depths over the middle 90 % of the height: the spline differs from one with 20 knots by 0.10 and 0.14 um (RMS)."""
 
 LEAST_STEP = 1e-3
 """Least difference of neighbouring coefficients of the spline, as a fraction of the height: depths increase."""

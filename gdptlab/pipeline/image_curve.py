@@ -20,8 +20,8 @@ BEYOND = 2
 """Slices that are added at either end, extrapolated: of the outermost particles none may have stood alone."""
 
 COMPONENTS = 16
-"""Number of principal components in which images are compared. Chosen on the channel's films: of the norm of lone
-images they hold 99 %, and hardly any noise."""
+"""Number of principal components in which images are compared. Measured on three of the channel's films: they hold 99 %
+of the squared norm of the images that stand alone. Noise is spread over some 1500."""
 
 NEAR, SUPPORT = 2.5, 2
 """Radius of a neighbourhood on the curve, in median distances of an image to the nearest of another particle; and the
