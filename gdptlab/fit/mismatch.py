@@ -108,7 +108,8 @@ def mismatch_error_um(mismatch: pd.DataFrame) -> float:
     TypeError, ValueError
         If it lacks `significance` or `z_error_um`.
     """
-    known = table("mismatch", mismatch, ("significance", "z_error_um")).dropna(subset="significance")
+    columns = ["significance", "z_error_um"]
+    known = table("mismatch", mismatch, columns)[columns].dropna()
     if not (known["significance"] > SURE).any():
         return 0.0
     return float(np.sqrt(np.square(known["z_error_um"]).mean()))
