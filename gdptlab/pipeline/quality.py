@@ -244,7 +244,7 @@ def _drift(drift_px: NDArray, size: int) -> Judgement:
 def _mismatch(mismatch: pd.DataFrame, span: float) -> Judgement:
     """Whether the mean image of a film's particles is the calibration's, of `span` µm."""
     error_um, known = mismatch_error_um(mismatch), mismatch.dropna()
-    finding = f"{mismatch['n'].sum()} particles are too few to compare"
+    finding = f"{mismatch['n'].sum()} particles, in too few places to compare"
     if len(known):
         finding = (
             f"mean images of {known['n'].sum()} particles differ by {_from_to(100 * known['mismatch'], '.1f')} %, by "
