@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
+from scipy.linalg import solve
 
 from gdptlab._compiled import compiled
 from gdptlab.fit.renderer import Columns
@@ -44,7 +45,7 @@ class Background:
         for _ in range(2):
             off = np.abs(frame - surface) * np.sqrt(weight)
             trust = weight * np.minimum(1, BOUNDED / np.maximum(off, BOUNDED))
-            surface = self.surface(np.linalg.solve(self.matrix(trust), self.gradient(frame, trust)))
+            surface = self.surface(solve(self.matrix(trust), self.gradient(frame, trust), assume_a="pos"))
         return level + surface
 
     def gradient(self, residual: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -20,6 +20,9 @@ LONGEST = np.array([1.0, 1.0, 3.0, 0.5])
 CLIMB = 4
 """Steps from another depth before the modes are free."""
 
+FREE = 2
+"""Steps with the modes free."""
+
 APART = 3.0
 """Slices: depths nearer than this are one."""
 
@@ -62,7 +65,7 @@ class Alone:
     def __init__(self, renderer: Renderer, fit: Fit, variance: Variance, valid: NDArray[np.bool_]) -> None:
         self._renderer, self._fit, self._variance, self._valid = renderer, fit, variance, valid
 
-    def climbed(self, trials: NDArray[np.float64], owner: NDArray[np.int64], steps: int = CLIMB) -> Trials:
+    def climbed(self, trials: NDArray[np.float64], owner: NDArray[np.int64], steps: int = 0) -> Trials:
         """Fit from `trials` (n, 4 + K), each in the stead of the particle `owner` (n,).
 
         The modes, in which the image is linear, are free in the last step only, whose gain is the one that the
@@ -70,7 +73,8 @@ class Alone:
         """
         for _ in range(steps):
             trials, *_ = self._stepped(trials, owner, by_mode=False)
-        trials, gain, matrix = self._stepped(trials, owner, by_mode=True)
+        for _ in range(FREE):
+            trials, gain, matrix = self._stepped(trials, owner, by_mode=True)
         return Trials(trials, gain, matrix)
 
     def _stepped(
@@ -97,7 +101,7 @@ class Alone:
     def best(self, slices: NDArray[np.float64]) -> Trials:
         """The best fit of each particle at another depth: starts at `slices` (P, S), NaN: none.
 
-        The start that promises most is climbed from. A particle that climbs back to its own depth has no other; its
+        The modes are free from where the best start led. A particle that climbs back to its own depth has no other; its
         gain is minus infinity.
         """
         places = self._fit.places
@@ -107,9 +111,9 @@ class Alone:
             return out
         trials = places[owner]
         trials[:, 2] = slices[owner, start]
-        matrix, right, gain = self._evaluated(trials, owner, by_mode=False)
-        promise = gain + right[:, 3] ** 2 / (2 * matrix[:, 3, 3])  # with the amplitude that suits the start
-        order = np.lexsort((-promise, owner))
+        for _ in range(CLIMB):
+            trials, gain, _ = self._stepped(trials, owner, by_mode=False)
+        order = np.lexsort((-gain, owner))
         first = order[np.unique(owner[order], return_index=True)[1]]
         own = owner[first]
         climbed = self.climbed(trials[first], own)

@@ -188,7 +188,7 @@ class Joint:
             weight = variance.weight(fit.image, pixels.valid)
             if again == 0 and (suits := self._suits(frame - fit.image, weight)) != surface:
                 surface, background = suits, None
-            likelier = self._likelier(fit, variance, pixels) if again < 2 else fit.places
+            likelier = self._likelier(fit, variance, pixels)
             places = np.concatenate([self._full.merged(likelier[stays], excess[stays]), new])
         velocity = np.zeros((len(fit.places), 3))
         return Explained(fit, stays, fit.places, velocity, population, surface, variance, pixels, gain, excess)

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve
-from scipy.ndimage import gaussian_filter, uniform_filter1d
+from scipy.ndimage import gaussian_filter, shift, uniform_filter1d
 from scipy.spatial import KDTree
 from scipy.stats import median_abs_deviation
 from skimage.registration import phase_cross_correlation
@@ -323,8 +323,7 @@ class _Learning:
                 self.heights += shift_
                 continue
             told = np.array([np.vdot(slope, mode) / power for mode in self.modes])
-            differ = np.any(self.modes, axis=(0, 2, 3))
-            self.modes[:, differ] -= told.astype(np.float32)[:, None, None, None] * slope[differ]
+            self.modes -= told.astype(np.float32)[:, None, None, None] * slope
             self.places[:, of] += shift_ + self.places[:, 4:] @ told
 
     def _regressed(
@@ -368,7 +367,7 @@ class _Learning:
         # Half a turn about the middle moves an image that is symmetric about c by -2 c.
         off = np.average(off, axis=0, weights=light[order] ** 2)
         flat = self.patterns.reshape(-1, *self.patterns.shape[2:])
-        self.patterns = np.stack([_shifted(pattern, -off) for pattern in flat]).reshape(self.patterns.shape)
+        self.patterns = _shifted(flat, -off).reshape(self.patterns.shape)
         self.places[:, :2] += off / self.fine
         self._prepare()
 
@@ -419,8 +418,7 @@ class _Learning:
             low = np.clip(slices + int(np.floor(height)), 0, len(rest) - 2)
             cut, part = self._cut(rest, i, half + margin), height % 1
             image = ((1 - part) * cut[low] + part * cut[low + 1]) / place[3]
-            off = np.rint(place[:2]) - place[:2]
-            moved = np.stack([_shifted(one, off) for one in image])
+            moved = _shifted(image, np.rint(place[:2]) - place[:2])
             around.append(moved[:, margin:-margin, margin:-margin].ravel())
         light = np.maximum(self.patterns[zone][0, :, :: self.fine, :: self.fine], 0)
         around = np.array(around) / np.sqrt(self.noise**2 + self.line[0] * light).ravel()
@@ -570,12 +568,9 @@ def _along(matrix: NDArray[np.float64], patterns: NDArray) -> NDArray[np.float32
     return np.einsum("kl,mlij->mkij", matrix.astype(np.float32), patterns, optimize=True).astype(np.float32)
 
 
-def _shifted(image: NDArray, off: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Image (m, m), square, shifted by `off` (down, to the right), px."""
-    to = np.array([[1, 0, off[1]], [0, 1, off[0]]])
-    return cv2.warpAffine(
-        image.astype(np.float32), to, image.shape, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-    )
+def _shifted(images: NDArray, off: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Images (N, m, m) shifted by `off` (down, to the right), px."""
+    return np.stack([shift(image, off, order=3, mode="nearest") for image in images])
 
 
 def _blurred(images: NDArray[np.float32], width: int) -> NDArray[np.float32]:
