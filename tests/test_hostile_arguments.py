@@ -56,6 +56,7 @@ TILTED = replace(CALIBRATION, report=REPORT)
 RESTING = pd.DataFrame(
     {"frame": [0, 0, 1, 1], "particle": [0, 1, 0, 1], "x_um": [1.0, 7, 1.5, 7.5], "y_um": 0.0, "z_um": [0.0, 4, 2, 6]}
 )
+MISMATCH = pd.DataFrame({"n": [50, 3], "mismatch": 0.02, "own": 0.01, "significance": 3.0, "z_error_um": 0.4})
 JOINT = gdptlab.locate(SCAN[3], CALIBRATION, method="joint").assign(frame=0)
 
 
@@ -129,6 +130,7 @@ def calls(folder: Path) -> dict[str, Call]:
         "gdptlab.Calibration.from_scan": call(Calibration.from_scan, **beads, beads_px=CENTRES, n_sub=3),
         "gdptlab.Calibration.with_subset": call(CALIBRATION.with_subset, n_sub=3),
         "gdptlab.Calibration.with_depth_factor": call(CALIBRATION.with_depth_factor, factor=1.33),
+        "gdptlab.Calibration.with_depth_error": call(CALIBRATION.with_depth_error, std_um=0.5),
         "gdptlab.Calibration.one_side": call(CALIBRATION.one_side, side="near"),
         "gdptlab.Calibration.save": call(CALIBRATION.save, path=folder / "a.npz"),
         "gdptlab.Calibration.load": call(Calibration.load, path=folder / "made.npz"),
@@ -190,6 +192,8 @@ def calls(folder: Path) -> dict[str, Call]:
         "experiment.watch": call(experiment.watch, times_s=[0.0, 0.04, 0.08], tau_s=0.05),
         "fit.explained": call(fit.explained, image=IMAGE, **made),
         "fit.learned": call(fit.learned, **beads, beads_px=CENTRES, field=False, modes=0, turns=1),
+        "fit.mismatch_error_um": call(fit.mismatch_error_um, mismatch=MISMATCH),
+        "fit.pattern_mismatch": call(fit.pattern_mismatch, "image", frames=[IMAGE], **made),
         "fit.own_bias_um": call(fit.own_bias_um, **made),
         "fit.own_error": call(fit.own_error, **made),
         "fit.expected_error": call(fit.expected_error, **made),
@@ -228,7 +232,7 @@ def calls(folder: Path) -> dict[str, Call]:
         ),
         "pipeline.open_images": call(pipeline.open_images, path=film),
         "pipeline.open_scan": call(pipeline.open_scan, path=scan, start_um=-3.0, step_um=1.0),
-        "pipeline.report": call(pipeline.report, **made),
+        "pipeline.report": call(pipeline.report, **made | {"mismatch": MISMATCH}),
         "pipeline.save_points": call(pipeline.save_points, table=TABLE, path=folder / "points.csv", program="napari"),
         "pipeline.save_table": call(pipeline.save_table, "settings", table=TABLE, path=folder / "table.csv", **made),
         "pipeline.with_errors": call(pipeline.with_errors, table=TABLE, **made),

@@ -29,13 +29,14 @@ CELLS = 4
 """Number of cells along x and along y into which a frame is divided. Only residuals of different cells are multiplied:
 a particle that hardly moves is in several frames, and what is peculiar to it is not common."""
 
-FEWEST = 10
-"""Fewest particles in a bin. Convention: a mean of fewer says little."""
+FEWEST = 8
+"""Fewest cells with particles, in a bin. Convention: half of them. With three, the last bin of 50 particles that rested
+in six frames was taken for a mismatch."""
 
 OWN = 0.33, 0.12
 """Fraction of the energy of the patterns' own error that remains in the mean over the slices of a bin and after a fit,
 and its standard deviation. Chosen on calibrations made again (`recalibration_errors`) of one noisy exposure of 51
-slices: 0.28 to 0.43."""
+slices: 0.28 to 0.42."""
 
 SURE = 2.5
 """Significance, standard deviations, from which on a mismatch is more than noise. Chosen on frames of three
@@ -43,7 +44,7 @@ calibrations: it is at most 0.6 in any bin with unchanged optics, and 3.3 or mor
 
 ABSORBED = 2.0
 """Error of z that the fit has absorbed, over what the residual would be if it were all along z. Chosen on the same: it
-is 1.4 to 2.1 with a magnification changed by 2 %, and 0.6 to 0.8 with a cylindrical lens changed by 5 %."""
+is 1.3 to 2.1 with a magnification changed by 2 %, and 0.6 to 0.8 with a cylindrical lens changed by 5 %."""
 
 
 def pattern_mismatch(frames: Iterable[ArrayLike], calibration: Calibration) -> pd.DataFrame:
@@ -76,7 +77,6 @@ def pattern_mismatch(frames: Iterable[ArrayLike], calibration: Calibration) -> p
     for frame in iterable("frames", frames):
         _add(image_array("frames", frame, 2), calibration, edges, sums, n)
     energy, std = np.transpose([_energy(each) for each in sums])
-    energy[n < FEWEST] = np.nan
     bins = [slice(*ends) for ends in pairwise(np.ceil(edges).astype(int))]
     pattern, slope, own = (np.array([values[part].mean() for part in bins]) for values in _energies(model))
     beyond = energy - OWN[0] * own
@@ -108,7 +108,8 @@ def mismatch_error_um(mismatch: pd.DataFrame) -> float:
     TypeError, ValueError
         If it lacks `significance` or `z_error_um`.
     """
-    known = table("mismatch", mismatch, ("significance", "z_error_um")).dropna(subset="significance")
+    columns = ["significance", "z_error_um"]
+    known = table("mismatch", mismatch, columns)[columns].dropna()
     if not (known["significance"] > SURE).any():
         return 0.0
     return float(np.sqrt(np.square(known["z_error_um"]).mean()))
@@ -139,7 +140,7 @@ def _energy(sums: NDArray[np.float64]) -> tuple[float, float]:
     Noise is left out of the square of a sum with the squares of its terms; the standard deviation is the jackknife's.
     """
     sums = sums[sums[:, 1].any(axis=(1, 2))]
-    if len(sums) < 3:
+    if len(sums) < FEWEST:
         return np.nan, np.nan
     sums[:, 0] = gaussian_filter(sums[:, 0], (0, ERROR_SCALE_PX, ERROR_SCALE_PX))
     total, squares = sums.sum(axis=0), np.square(sums).sum(axis=0)

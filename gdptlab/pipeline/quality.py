@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab._checks import LARGEST, positive
+from gdptlab._checks import LARGEST, positive, table
 from gdptlab.calibration import Calibration, checked
 from gdptlab.denoising import noise_level, signal_to_noise
 from gdptlab.fit.bounds import expected_error
@@ -152,6 +152,7 @@ def report(calibration: Calibration, mismatch: pd.DataFrame | None = None) -> pd
             _drift(made.drift_px, calibration.size),
         ]
     if mismatch is not None:
+        table("mismatch", mismatch, ("n", "mismatch", "own"))
         judgements.append(_mismatch(mismatch, span))
     verdicts = ["bad" if each.bad else "look" if each.look else "good" for each in judgements]
     advice = ["" if v == "good" else each.advice for each, v in zip(judgements, verdicts, strict=True)]
@@ -278,7 +279,7 @@ def _drift(drift_px: NDArray, size: int) -> Judgement:
 def _mismatch(mismatch: pd.DataFrame, span: float) -> Judgement:
     """Whether the mean image of a film's particles is the calibration's, of `span` µm."""
     error_um, known = mismatch_error_um(mismatch), mismatch.dropna()
-    finding = f"{mismatch['n'].sum()} particles are too few to compare"
+    finding = f"{mismatch['n'].sum()} particles, in too few places to compare"
     if len(known):
         finding = (
             f"mean images of {known['n'].sum()} particles differ by {_from_to(100 * known['mismatch'], '.1f')} %, by "
