@@ -7,7 +7,7 @@ from conftest import IMAGE_TYPES, Z_UM, table
 from gdptlab import Calibration, locate, match
 from gdptlab.correlation import normalised
 from gdptlab.experiment.camera import Camera
-from gdptlab.fit.bounds import _derivatives, expected_error, own_error
+from gdptlab.fit.bounds import derivatives, expected_error, own_error
 from gdptlab.fit.pattern import continued, particle_light
 
 STD = ["x_std_px", "y_std_px", "z_std_um"]
@@ -126,7 +126,7 @@ def photon_noisy(request, clean_stack):
 def test_the_bound_is_never_far_below_the_true_one(photon_noisy):
     """Noise in the images makes a naive bound half the true one where images are dim."""
     light, variance, made = photon_noisy
-    columns = _derivatives(light, Z_UM)
+    columns = derivatives(light, Z_UM)
     fisher = columns.transpose(0, 2, 1) @ (columns / variance.reshape(len(light), -1, 1))
     true = np.sqrt(np.diagonal(np.linalg.inv(fisher), axis1=1, axis2=2))[:, :3]
     ratio = np.array([expected_error(calibration)[STD] / true for calibration in made])
@@ -138,7 +138,7 @@ def test_the_bound_is_never_far_below_the_true_one(photon_noisy):
 def test_own_error_is_the_true_one(photon_noisy):
     """Errors of z that calibrations make are as large as they say."""
     light, _, made = photon_noisy
-    rows, ratio = np.linalg.pinv(_derivatives(light, Z_UM))[:, 2], []
+    rows, ratio = np.linalg.pinv(derivatives(light, Z_UM))[:, 2], []
     for calibration in made:
         error = np.einsum("kp,kp->k", rows, (particle_light(calibration) - light).reshape(len(light), -1))
         ratio.append(error / own_error(calibration)[:, 2])
