@@ -54,7 +54,7 @@ def test_pixels_left_out_say_nothing(renderer):
     frame = drawn(renderer, true, SHAPE)
     frame[~valid] = 60_000
     _, trials = alone(renderer, true, frame, valid=valid)
-    np.testing.assert_allclose(trials.climbed(true, np.array([0])).places, true, atol=0.02)
+    np.testing.assert_allclose(trials.freed(true, np.array([0])).places, true, atol=0.02)
 
 
 @pytest.mark.parametrize("fine", [1, 2])
@@ -66,8 +66,8 @@ def test_modes_are_found(fine):
     start = true.copy()
     start[0, 4:] = 0
     _, trials = alone(renderer, start, frame, noise=0.02)
-    found = trials.climbed(start, np.array([0]), steps=0)
+    found = trials.freed(start, np.array([0]))
     for _ in range(8):
-        found = trials.climbed(found.places, np.array([0]), steps=0)
+        found = trials.freed(found.places, np.array([0]))
     np.testing.assert_allclose(found.places, true, atol=0.1)
     assert (found.variance_of_modes() > 0).all()

@@ -21,7 +21,8 @@ CLIMB = 4
 """Steps from another depth before the modes are free."""
 
 FREE = 2
-"""Steps with the modes free."""
+"""Steps with the modes free, in which the image is linear. Chosen on four frames of the planar beads about focus: 0.952
+of the beads are found with two, 0.940 with one."""
 
 APART = 3.0
 """Slices: depths nearer than this are one."""
@@ -65,14 +66,11 @@ class Alone:
     def __init__(self, renderer: Renderer, fit: Fit, variance: Variance, valid: NDArray[np.bool_]) -> None:
         self._renderer, self._fit, self._variance, self._valid = renderer, fit, variance, valid
 
-    def climbed(self, trials: NDArray[np.float64], owner: NDArray[np.int64], steps: int = 0) -> Trials:
-        """Fit from `trials` (n, 4 + K), each in the stead of the particle `owner` (n,).
+    def freed(self, trials: NDArray[np.float64], owner: NDArray[np.int64]) -> Trials:
+        """Fit from `trials` (n, 4 + K) near the best fit, modes free, each in the stead of the particle `owner` (n,).
 
-        The modes, in which the image is linear, are free in the last step only, whose gain is the one that the
-        quadratic approximation promises.
+        The gain is the one that the quadratic approximation of the last step promises.
         """
-        for _ in range(steps):
-            trials, *_ = self._stepped(trials, owner, by_mode=False)
         for _ in range(FREE):
             trials, gain, matrix = self._stepped(trials, owner, by_mode=True)
         return Trials(trials, gain, matrix)
@@ -116,9 +114,9 @@ class Alone:
         order = np.lexsort((-gain, owner))
         first = order[np.unique(owner[order], return_index=True)[1]]
         own = owner[first]
-        climbed = self.climbed(trials[first], own)
-        out.places[own], out.matrix[own] = climbed.places, climbed.matrix
-        out.gain[own] = np.where(np.abs(climbed.places[:, 2] - places[own, 2]) < APART, -np.inf, climbed.gain)
+        freed = self.freed(trials[first], own)
+        out.places[own], out.matrix[own] = freed.places, freed.matrix
+        out.gain[own] = np.where(np.abs(freed.places[:, 2] - places[own, 2]) < APART, -np.inf, freed.gain)
         return out
 
     def _evaluated(

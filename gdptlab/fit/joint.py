@@ -235,7 +235,7 @@ class Joint:
     def _alone(self, fit: Fit, variance: Variance, pixels: Pixels) -> tuple[Trials, Trials]:
         """Each particle of a fit alone, its modes free: from where it is, and on the other side of focus."""
         alone = Alone(self._full.renderer, fit, variance, pixels.valid)
-        own = alone.climbed(fit.places, np.arange(len(fit.places)), 0)
+        own = alone.freed(fit.places, np.arange(len(fit.places)))
         height = field_terms(fit.places[:, 1], fit.places[:, 0], self.shape) @ self.model.surface
         twin = np.interp(fit.places[:, 2] - height, np.arange(self.model.count), self.model.twin) + height
         return own, alone.best(np.clip(twin[:, None] + ASTRAY, 0, self.model.count - 1))
