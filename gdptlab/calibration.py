@@ -311,7 +311,8 @@ class Calibration:
             x and y of the beads to use, px, all of them; found if not given.
         size : int, optional
             Rows and columns of a template, odd. If not given, just enough for the widest image of the beads, or less
-            if more beads of the scan, whose depths are known, are then found. With `beads_px`, the former.
+            if more beads of the scan, whose depths are known, are then found. With `beads_px`, `field` or `modes`, the
+            former.
         n_sub : int, optional
             Images that frames are correlated with. If not given, as many as it takes for an image at any depth to be
             like one of them.
@@ -341,9 +342,10 @@ class Calibration:
         camera = None if prepare is None else preparation(prepare).camera
         if camera is not None:
             scan = np.asarray(camera(scan))
-        calibration = averaged_beads(scan, z_um, beads_px=beads_px, size=size, n_sub=n_sub)
+        joint = flag("field", field) or whole("modes", modes, 0, 100) > 0
+        calibration = averaged_beads(scan, z_um, beads_px=beads_px, size=size, n_sub=n_sub, smaller=not joint)
         calibration = replace(calibration, camera=camera)
-        if not flag("field", field) and whole("modes", modes, 0, 100) == 0:
+        if not joint:
             return calibration
         from gdptlab.fit.learning import learned
 

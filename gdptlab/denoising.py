@@ -1,5 +1,7 @@
 """What noise there is in a stack of images, and the same stack with far less of it."""
 
+from itertools import product
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
@@ -65,21 +67,22 @@ def _smoothed(stack: NDArray[np.float32], variance: NDArray[np.float64]) -> NDAr
     centred = (stack - levels).astype(np.float32)
     variance = (variance + variance[:, ::-1]).astype(np.float32)
     variance = (variance + variance[:, :, ::-1])[:, half - over :, half - over :] / 16
+    sides = list(product((1, -1), repeat=2))
+    parts = [centred + down * centred[:, ::-1] for down, _ in sides]
+    parts = [(part + across * part[:, :, ::-1]) / 4 for part, (_, across) in zip(parts, sides, strict=True)]
+    quarters = _filtered(np.stack(parts)[..., half - over :, half - over :], variance)[..., over:, over:]
     smooth, away = np.zeros_like(centred), np.arange(-half, half + 1)
-    sides = {1: np.ones(len(away), np.float32), -1: np.sign(away).astype(np.float32)}
-    for down, y_side in sides.items():
-        part = (centred + down * centred[:, ::-1]) / 2
-        for across, x_side in sides.items():
-            quarter = (part + across * part[:, :, ::-1])[:, half - over :, half - over :] / 2
-            quarter = _filtered(quarter, variance)[:, over:, over:]
-            smooth += quarter[:, np.abs(away)][:, :, np.abs(away)] * (y_side[:, None] * x_side)
+    sign = {1: np.ones(len(away), np.float32), -1: np.sign(away).astype(np.float32)}
+    for quarter, (down, across) in zip(quarters, sides, strict=True):
+        smooth += quarter[:, np.abs(away)][:, :, np.abs(away)] * (sign[down][:, None] * sign[across])
     levels -= smooth.mean(axis=(1, 2), keepdims=True)
     return (smooth + levels).astype(np.float32)
 
 
-def _filtered(stack: NDArray[np.float32], variance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Images (N, m, m) with noise of that variance (N, m, m), filtered in blocks along z, y and x."""
-    count, edge = min(WINDOW, len(stack)), min(BLOCK, stack.shape[1])
+def _filtered(stacks: NDArray[np.float32], variance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Stacks (S, N, m, m) with noise of that variance (N, m, m), filtered in blocks along z, y and x."""
+    slices, size = variance.shape[:2]
+    count, edge = min(WINDOW, slices), min(BLOCK, size)
     # Polynomials, not cosines, as images still change at the ends of a window.
     along_z = np.linalg.qr(np.vander(np.linspace(-1, 1, count), increasing=True))[0].astype(np.float32)
     trust = (1 - np.abs(np.arange(count) - (count - 1) / 2) / ((count + 1) / 2)).astype(np.float32) ** 2
@@ -91,23 +94,31 @@ def _filtered(stack: NDArray[np.float32], variance: NDArray[np.float32]) -> NDAr
     squares = dct(np.eye(edge, dtype=np.float32), axis=0, norm="ortho") ** 2
     taper = np.sin((np.arange(edge) + 0.5) * np.pi / edge).astype(np.float32)
     taper = taper[:, None] * taper
-    starts = np.rint(np.linspace(0, stack.shape[1] - edge, -(-2 * (stack.shape[1] - edge) // edge) + 1)).astype(int)
-    smooth, weight = np.zeros_like(stack), np.zeros_like(stack)
-    for top in starts:
-        for left in starts:
-            block = np.s_[:, top : top + edge, left : left + edge]
-            spectra = sliding_window_view(dctn(stack[block], axes=(1, 2), norm="ortho"), count, axis=0) @ along_z
-            power = blurs[0] @ (spectra**2 @ blurs[2].T).reshape(len(spectra), edge, -1)
-            power = blurs[1] @ power.reshape(spectra.shape)
-            noise = sliding_window_view(squares @ variance[block] @ squares.T, count, axis=0) @ along_z**2
-            spectra *= 1 - np.minimum(DOUBT * noise / np.where(power > 0, power, 1), 1)
-            filtered, together = np.zeros_like(stack[block]), np.zeros((len(stack), 1, 1), np.float32)
-            for k, each in enumerate(trust):
-                filtered[k : len(stack) - count + 1 + k] += each * (spectra @ along_z[k])
-                together[k : len(stack) - count + 1 + k] += each
-            smooth[block] += taper * idctn(filtered / together, axes=(1, 2), norm="ortho")
-            weight[block] += taper
+    starts = np.rint(np.linspace(0, size - edge, -(-2 * (size - edge) // edge) + 1)).astype(int)
+    overlap = np.convolve(trust, np.ones(slices - count + 1, np.float32))  # of the windows at each slice
+    smooth, weight = np.zeros_like(stacks), np.zeros_like(variance)
+    for top, left in product(starts, starts):
+        block = np.s_[:, top : top + edge, left : left + edge]
+        # z is the last axis, so that each step is one product of large matrices.
+        noise = DOUBT * (_windows(squares @ variance[block] @ squares.T, count) @ along_z**2)
+        weight[block] += taper
+        for stack, out in zip(stacks, smooth, strict=True):
+            spectra = _windows(dctn(stack[block], axes=(1, 2), norm="ortho"), count) @ along_z
+            power = blurs[0] @ (spectra**2 @ blurs[2].T).reshape(edge, -1)
+            power = (blurs[1] @ power.reshape(edge, edge, -1)).reshape(spectra.shape)
+            spectra *= 1 - np.minimum(noise / np.where(power > 0, power, 1), 1)
+            parts = (spectra @ (along_z.T * trust)).reshape(edge, edge, -1, count)
+            filtered = np.zeros((edge, edge, slices), np.float32)
+            for k in range(count):
+                filtered[..., k : k + parts.shape[2]] += parts[..., k]
+            out[block] += taper * idctn(np.moveaxis(filtered / overlap, 2, 0), axes=(1, 2), norm="ortho")
     return smooth / weight
+
+
+def _windows(images: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    """All `count` consecutive values along z of images (N, m, m), a row each, by row, column and first slice."""
+    along = np.ascontiguousarray(np.moveaxis(images, 0, 2))
+    return sliding_window_view(along, count, axis=2).reshape(-1, count)
 
 
 def noise_level(images: NDArray) -> float:

@@ -194,8 +194,12 @@ def averaged_beads(
     beads_px: ArrayLike | None = None,
     size: int | None = None,
     n_sub: int | None = None,
+    smaller: bool = True,
 ) -> Calibration:
-    """Calibrate with the average of a scan's beads; see `Calibration.from_scan`."""
+    """Calibrate with the average of a scan's beads; see `Calibration.from_scan`.
+
+    With `smaller` the size that is found may be less than that of the widest image.
+    """
     scan, z_um = _checked(scan, z_um)
     if size is not None and whole("size", size, 3, 10_001) % 2 == 0:
         raise ValueError(f"size: got {size} px, allowed are odd sizes")
@@ -205,7 +209,7 @@ def averaged_beads(
     beads = _table(overview, _given(beads_px)) if given else _found(overview)
     widest = size or _size(scan, beads)
     beads, stack, drift, clipped = _averaged(scan, z_um, beads, widest, given=given)
-    if size is None and not given:
+    if size is None and smaller and not given:
         stack = _fitting(stack, scan, z_um, beads)
     calibration = Calibration.from_stack(stack, z_um, n_sub=n_sub or min(9, len(scan)))
     if n_sub is None:
