@@ -456,8 +456,8 @@ def test_both_sides_of_focus(microscope):
     """Without astigmatism wide images have a twin beyond focus; the likelihood decides, and says how surely."""
     plain = Microscope(cylinder_um=None)
     made = Calibration.from_stack(plain.stack(Z_UM, SIZE_PX, rng=305), Z_UM)
-    true = anywhere(np.random.default_rng(306), 40)
-    measured = joint(plain.render(true, rng=307), made)
+    true = anywhere(np.random.default_rng(306), 25, (400, 400))
+    measured = joint(plain.render(true, (400, 400), rng=307), made)
     found = scores(measured, true)
     assert found["recall"] >= 0.95 and found["precision"] >= 0.95
     has = measured["z_other_um"].notna()

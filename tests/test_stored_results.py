@@ -15,9 +15,9 @@ EXACT = {"_px": 1e-6, "_um": 1e-5, "": 1e-5}
 ELSEWHERE = {"_px": 2e-3, "_um": 2e-2, "": 2e-2}
 """On others, whose compiled sums round in another order, which the steps of a fit enlarge."""
 
-OF_STD = 0.1
-"""Fraction of a position's standard deviation that may be off there, too, if that is more: where particles overlap, the
-steps enlarge what rounding makes of the sums, and the frames that follow begin with it."""
+FEW = 0.02
+"""Fraction of the rows that may be off there by more: where particles lie on top of each other, the steps enlarge what
+rounding makes of the sums, and the frames that follow begin with it."""
 
 
 def tolerance(column: str, allowed: dict[str, float]) -> float:
@@ -50,9 +50,5 @@ def test_as_stored(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
         off = np.abs(np.where(finite, here, 0) - np.where(finite, there, 0))
         if not column.endswith(("_px", "_um")):  # of numbers that may be large, a fraction
             off /= np.maximum(np.abs(np.where(finite, there, 1)), 1)
-        most = np.full(len(off), tolerance(column, allowed))
-        std = column.replace("_", "_std_", 1)
-        if not same and std in stored and column != std:
-            most = np.fmax(most, OF_STD * stored[std])
-        assert (off <= most)[finite].all(), column
+        assert (off > tolerance(column, allowed)).sum() <= (0 if same else FEW * len(off)), column
         assert (np.isnan(found[column]) == np.isnan(stored[column])).all(), column
