@@ -353,7 +353,9 @@ class Joint:
         unusual = np.log(amplitude / explained.population.centre) / explained.population.sigma
         beyond = explained.excess - 1
         certain = np.maximum(beyond - 2 * np.sqrt(2 / fit.area), 0)
-        misfit = np.sqrt(1 + CORRELATED * np.maximum(beyond, 0) + certain * fit.area / WAYS + (unusual / UNUSUAL) ** 2)
+        expected = fit.chi2 / np.maximum(explained.excess, 1e-12)  # of noise and the errors of all patterns there
+        beyond = CORRELATED * np.maximum(beyond, 0) + certain * fit.area / WAYS
+        misfit = np.sqrt(expected + beyond + (unusual / UNUSUAL) ** 2)
         own_error = np.stack([np.interp(slices, at, error) for error in model.own_error.T])
         y_std, x_std, slice_std = np.sqrt(variance).T
         frame_std = x_std, y_std, slice_std * np.interp(slices, at, np.gradient(model.z_um))
