@@ -33,8 +33,8 @@ to 1.2 where all is found and 2 to 8 where a third is lost; one repeat finds nea
 
 SLOW = 3
 """Number of frames in a row that must take longer than the interval for the next to be left to the cheaper evaluator.
-Chosen: one slow frame, such as the first, costs some dropped frames, and the fit bridges them. With 1, each of these
-would cost a wrong fraction as well; with 10, the monitor would be late for a second."""
+Chosen: one slow frame, such as the first or one that is searched anew, costs some dropped frames, and the fit bridges
+them. With 1, each of these would cost a wrong fraction as well; with 10, the monitor would be late for a second."""
 
 LONGEST = 64
 """Largest number of frames that are left to the cheaper evaluator at a time. Chosen: 2.6 s at 25 frames/s. With 8, a
@@ -166,7 +166,7 @@ class Follower:
         self._slow += 1
         if self._slow < SLOW:
             return ""
-        self._slow = SLOW - 1  # a trial that is slow again is enough
+        self._slow = 0  # a trial may begin with a search, which is slow once
         self._left, self._pause = self._pause, min(2 * self._pause, LONGEST)
         took = f"{1e3 * took_s:.0f} ms, allowed {1e3 * self._interval_s:.0f}"
         return f"the joint fit took {took}: the next {self._left} by the cheaper evaluator"
