@@ -67,6 +67,21 @@ class PlanarBeads:
     published: dict[str, pd.DataFrame]
 
 
+@dataclass(frozen=True)
+class LabelledFrames:
+    """Frames in which every particle is known (Coutinho et al. 2026, see `defocused_particles`).
+
+    Attributes
+    ----------
+    frames : uint16 array (10, 1024, 1024)
+    truth : DataFrame
+        `frame`, `x_px`, `y_px`, `z_um` of 68 particles in each.
+    """
+
+    frames: NDArray[np.uint16]
+    truth: pd.DataFrame
+
+
 def sample(image_type: str = "fluorescent") -> Sample:
     """Load a synthetic sample (5 µm spheres, 10x/0.3, astigmatic; see `data/README.md`).
 
@@ -138,6 +153,28 @@ def astigmatic_bead() -> NDArray[np.float32]:
         "data/external/psf_astig, or name the folder above it in the variable GDPTLAB_DATA.",
     )
     return tifffile.imread(folder / "psf_astig.tif").astype(np.float32)
+
+
+def defocused_particles() -> LabelledFrames:
+    """Load synthetic frames of other optics, plain defocus, no scan, if they are on this machine.
+
+    They belong to G. Coutinho, A. S. Moita, A. L. N. Moreira and M. Rossi (arXiv 2606.00076; GPL-3.0) and are not part
+    of this repository. They are looked for in a folder `defocustracker_ai`, where `planar_beads` looks. Depths, from
+    -100 to -15, have no unit there; micrometres are assumed.
+
+    Raises
+    ------
+    FileNotFoundError
+        If they are in neither folder; the message says how to get them.
+    """
+    folder = _external(
+        "defocustracker_ai",
+        "The frames with known particles are not on this machine. They are ten frames of DefocusTrackerAI's test set "
+        "synthetic_D_min_16px_NS_0100; put frames.tif and truth.csv (frame, x_px, y_px, z_um, counted from 0) into "
+        "data/external/defocustracker_ai, or name the folder above it in the variable GDPTLAB_DATA.",
+    )
+    truth = pd.read_csv(folder / "truth.csv")[["frame", "x_px", "y_px", "z_um"]]
+    return LabelledFrames(tifffile.imread(folder / "frames.tif"), truth)
 
 
 def _external(name: str, missing: str) -> Path:

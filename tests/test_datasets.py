@@ -117,6 +117,20 @@ def test_one_bead_measures_the_others(beads):
     assert rmse <= RMSE_UM
 
 
+def test_the_particles_of_known_depth_are_there_or_the_message_says_where_to_get_them(monkeypatch, tmp_path):
+    try:
+        labelled = datasets.defocused_particles()
+    except FileNotFoundError as absent:
+        assert "DefocusTrackerAI" in str(absent)
+        pytest.skip(str(absent))
+    assert labelled.frames.shape == (10, 1024, 1024) and labelled.frames.dtype == np.uint16
+    assert (labelled.truth.groupby("frame").size() == 68).all() and labelled.truth["z_um"].between(-100, -15).all()
+    monkeypatch.setenv("GDPTLAB_DATA", str(tmp_path))
+    monkeypatch.setattr(datasets, "DATA", tmp_path)
+    with pytest.raises(FileNotFoundError, match="GDPTLAB_DATA"):
+        datasets.defocused_particles()
+
+
 def test_the_astigmatic_bead_is_there_or_the_message_says_where_to_get_it(monkeypatch, tmp_path):
     try:
         bead = datasets.astigmatic_bead()

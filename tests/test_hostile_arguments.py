@@ -304,6 +304,7 @@ NOT_CALLED = {
     "gdptlab.Calibration": "made by its constructors, which are called",
     "datasets.planar_beads": "takes nothing",
     "datasets.astigmatic_bead": "takes nothing",
+    "datasets.defocused_particles": "takes nothing",
     "gdptlab.versions": "takes nothing",
     "experiment.IMAGE_TYPES": "a tuple",
     "experiment.make_samples": "writes the samples of the repository",

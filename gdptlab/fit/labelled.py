@@ -16,7 +16,7 @@ from gdptlab.fit.background import Background
 from gdptlab.fit.bounds import REPEATS, SMOOTHED, derivatives
 from gdptlab.fit.model import PatternModel, error_density
 from gdptlab.fit.pattern import continued
-from gdptlab.fit.renderer import Columns, Renderer, along_z
+from gdptlab.fit.renderer import Columns, Renderer, along_z, spline_weights, weighted
 
 SMOOTHNESS = 1e-3
 """Weight of the squares of the patterns' second differences along z, in units of the mean weight of a slice. It only
@@ -315,16 +315,6 @@ def _along(matrix: NDArray, nodes: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @compiled
-def _four(f):  # pragma: no cover
-    """Weights of the four nodes of a cubic spline about a point at `f` between the middle two."""
-    g = 1 - f
-    four = np.empty(4, np.float32)
-    four[0], four[3] = g * g * g / 6, f * f * f / 6
-    four[1], four[2] = (3 * f * f * f - 6 * f * f + 4) / 6, (3 * g * g * g - 6 * g * g + 4) / 6
-    return four
-
-
-@compiled
 def _ends(position, half, size):  # pragma: no cover
     """First pixel and end of the support of a particle, cut at the frame."""
     return max(int(np.ceil(position - half)), 0), min(int(np.floor(position + half)) + 1, size)
@@ -332,32 +322,30 @@ def _ends(position, half, size):  # pragma: no cover
 
 @compiled
 def _draw(nodes, frame, places, fine, half, out):  # pragma: no cover
-    """Add the images of particles to `out`: along z, then y, then x."""
-    levels, m = nodes.shape[0], nodes.shape[1]
+    """Add the images of particles to `out`: along z, then y, then x.
+
+    The renderer itself takes patterns, not nodes, and its supports change with the amplitude, so that it has no
+    transpose in the nodes, and drawing with it takes 4 to 5 times as long, as each step needs it anew.
+    """
+    levels, m, one = nodes.shape[0], nodes.shape[1], np.float32(1)
     plane, line = np.empty((m, m), np.float32), np.empty(m, np.float32)
     for i in range(len(places)):
         y, x, s, amplitude = places[i]
         k = min(max(int(np.floor(s)), 0), levels - 4)
-        z = _four(s - k) * np.float32(amplitude)
+        z = spline_weights(s - k)[0]
         for r in range(m):
-            for c in range(m):
-                plane[r, c] = (
-                    z[0] * nodes[k, r, c] + z[1] * nodes[k + 1, r, c]
-                    + z[2] * nodes[k + 2, r, c] + z[3] * nodes[k + 3, r, c]
-                )  # fmt: skip
+            weighted(nodes[k : k + 4, r], z, np.float32(amplitude), m, plane[r], False)
         y0, y1 = _ends(y, half, out.shape[1])
         x0, x1 = _ends(x, half, out.shape[2])
         top, left = fine * (y0 - y) + fine * half, fine * (x0 - x) + fine * half
         row, column = int(np.floor(top)), int(np.floor(left))
-        v, h = _four(top - row), _four(left - column)
+        v, h = spline_weights(top - row)[0], spline_weights(left - column)[0]
+        q = column + EDGE - 1
+        four = line[q::fine], line[q + 1 :: fine], line[q + 2 :: fine], line[q + 3 :: fine]
         for r in range(y0, y1):
             j = row + fine * (r - y0) + EDGE - 1
-            for c in range(m):
-                line[c] = v[0] * plane[j, c] + v[1] * plane[j + 1, c] + v[2] * plane[j + 2, c] + v[3] * plane[j + 3, c]
-            image = out[frame[i], r]
-            for c in range(x0, x1):
-                q = column + fine * (c - x0) + EDGE - 1
-                image[c] += h[0] * line[q] + h[1] * line[q + 1] + h[2] * line[q + 2] + h[3] * line[q + 3]
+            weighted(plane[j : j + 4], v, one, m, line, False)
+            weighted(four, h, one, x1 - x0, out[frame[i], r, x0:], True)
 
 
 @compiled
@@ -371,7 +359,7 @@ def _collect(images, frame, places, fine, half, out):  # pragma: no cover
         x0, x1 = _ends(x, half, images.shape[2])
         top, left = fine * (y0 - y) + fine * half, fine * (x0 - x) + fine * half
         row, column = int(np.floor(top)), int(np.floor(left))
-        v, h = _four(top - row), _four(left - column)
+        v, h = spline_weights(top - row)[0], spline_weights(left - column)[0]
         plane[:] = 0
         for r in range(y0, y1):
             line[:] = 0
@@ -388,9 +376,10 @@ def _collect(images, frame, places, fine, half, out):  # pragma: no cover
                 for c in range(m):
                     into[c] += v[n] * line[c]
         k = min(max(int(np.floor(s)), 0), levels - 4)
-        z = _four(s - k) * np.float32(amplitude)
+        z = spline_weights(s - k)[0]
         for n in range(4):
+            factor = np.float32(amplitude) * z[n]
             for r in range(m):
                 into, given = out[k + n, r], plane[r]
                 for c in range(m):
-                    into[c] += z[n] * given[c]
+                    into[c] += factor * given[c]

@@ -310,7 +310,7 @@ def _support(patterns: NDArray, fine: int, noise: float, error: NDArray | None) 
 
 
 @inlined
-def _spline(f):  # pragma: no cover
+def spline_weights(f):  # pragma: no cover
     """Weights, and their derivatives, of the four nodes around a point at `f` between the middle two."""
     g = 1 - f
     weights = (g * g * g / 6, (3 * f * f * f - 6 * f * f + 4) / 6, (3 * g * g * g - 6 * g * g + 4) / 6, f * f * f / 6)
@@ -339,12 +339,12 @@ def _draw(
         if rows <= 0 or columns <= 0:
             continue
         k = min(max(int(np.floor(slices[i])), 0), levels - 4)
-        z, dz = _spline(slices[i] - k)
+        z, dz = spline_weights(slices[i] - k)
         used = nodes.shape[3] if differ[0] <= k <= differ[1] else terms
         top, left = fine * (y0 - places[i, 0]) + middle, fine * (x0 - places[i, 1]) + middle
         row, column = int(np.floor(top)) - 1, int(np.floor(left)) - 1
-        v, dv = _spline(top - row - 1)
-        h, dh = _spline(left - column - 1)
+        v, dv = spline_weights(top - row - 1)
+        h, dh = spline_weights(left - column - 1)
         begin, offset = column // fine, column % fine
         across = min(columns + 3, width - begin)
         for j in range(fine * (rows - 1) + 4):
@@ -357,10 +357,10 @@ def _draw(
                     for n in range(4):
                         for t in range(0, used, 4):
                             four = nodes[k + n, row + j, p, t : t + 4, begin:]
-                            _weighted(four, factors[i, t : t + 4], np.float32(1), across, sums[n], t > 0)
-                _weighted(lines, z, np.float32(1), across, scratch[0, j % fine, p, s:], False)
+                            weighted(four, factors[i, t : t + 4], np.float32(1), across, sums[n], t > 0)
+                weighted(lines, z, np.float32(1), across, scratch[0, j % fine, p, s:], False)
                 if derivatives:
-                    _weighted(lines, dz, np.float32(1), across, scratch[1, j % fine, p, s:], False)
+                    weighted(lines, dz, np.float32(1), across, scratch[1, j % fine, p, s:], False)
         s, light, step = starts[i], np.float32(places[i, 3]), np.float32(-places[i, 3] * fine)
         _along_x(scratch[0], offset, h, rows, across, scratch[2])
         _along_y(scratch[2], v, np.float32(1), rows, columns, across, values[3, s:])
@@ -378,13 +378,13 @@ def _draw(
             for j in range(fine * (rows - 1) + 4):
                 for p in range(fine):
                     out = scratch[0, j % fine, p, (j // fine) * across :]
-                    _weighted(nodes[k : k + 4, row + j, p, terms + m - 4, begin:], z, np.float32(1), across, out, False)
+                    weighted(nodes[k : k + 4, row + j, p, terms + m - 4, begin:], z, np.float32(1), across, out, False)
             _along_x(scratch[0], offset, h, rows, across, scratch[2])
             _along_y(scratch[2], v, light, rows, columns, across, values[m, s:])
 
 
 @inlined
-def _weighted(lines, weights, factor, count, out, add):  # pragma: no cover
+def weighted(lines, weights, factor, count, out, add):  # pragma: no cover
     """Set `out` (count), or add to it, the sum of four `lines` with their `weights`, times a factor."""
     a0, a1, a2, a3 = lines[0], lines[1], lines[2], lines[3]
     w0, w1, w2, w3 = factor * weights[0], factor * weights[1], factor * weights[2], factor * weights[3]
@@ -408,7 +408,7 @@ def _along_x(lines, offset, h, rows, across, out):  # pragma: no cover
             lines[p, (offset + 2) % fine, (offset + 2) // fine :],
             lines[p, (offset + 3) % fine, (offset + 3) // fine :],
         )
-        _weighted(four, h, np.float32(1), count, out[p, 0], False)
+        weighted(four, h, np.float32(1), count, out[p, 0], False)
 
 
 @inlined
@@ -422,7 +422,7 @@ def _along_y(lines, v, factor, rows, columns, across, image):  # pragma: no cove
             lines[2 % fine, 0, (r + 2 // fine) * across :],
             lines[3 % fine, 0, (r + 3 // fine) * across :],
         )
-        _weighted(four, v, factor, columns, image[r * columns :], False)
+        weighted(four, v, factor, columns, image[r * columns :], False)
 
 
 @compiled
