@@ -241,7 +241,7 @@ def _refined(
     """Walk every candidate along the stack and across the pixels to its best C_m (0 if the walk leaves the frame)."""
     last = len(calibration) - 1
     start = _pixels(image, calibration, position), np.clip(np.rint(slice_), 0, last)
-    first, k, cm, shift = calibration.displacement.walk(image, *start)
+    first, k, cm, shift = calibration.displacement.refine(image, *start)
     part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[k], -0.5, 0.5)
     inner = (k > 0) & (k < last)
     return first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1), k + np.where(inner, part, 0), cm
