@@ -219,6 +219,9 @@ def _candidates(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Peaks of the correlation maps: positions (y, x) (n, 2), z in slices (n,), C_m (n,)."""
     scale, near = (2, 1) if calibration.half_resolution else (1, 2)
+    margin = AROUND_PX if min(image.shape) < calibration.size + AROUND_PX else 0
+    if margin:  # the rim of maps, where no peak is looked for, would be most of them
+        image = cv2.copyMakeBorder(image, *(margin,) * 4, cv2.BORDER_REPLICATE)
     searched = cv2.pyrDown(image) if scale == 2 else image
     maps = calibration.correlator(searched.shape)(searched)
     position, cm, profile = peaks(maps, threshold, near)
@@ -226,7 +229,7 @@ def _candidates(
     k = np.clip(agreement.argmax(axis=1), 1, len(calibration) - 2)
     slice_ = k + vertex(agreement[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
     middle = calibration.search_templates.shape[-1] // 2
-    return scale * (position + middle), slice_, cm
+    return scale * (position + middle) - margin, slice_, cm
 
 
 def _pixels(image: NDArray[np.float32], calibration: Calibration, position: NDArray) -> NDArray[np.int64]:
@@ -241,7 +244,7 @@ def _refined(
     """Walk every candidate along the stack and across the pixels to its best C_m (0 if the walk leaves the frame)."""
     last = len(calibration) - 1
     start = _pixels(image, calibration, position), np.clip(np.rint(slice_), 0, last)
-    first, k, cm, shift = calibration.displacement.walk(image, *start)
+    first, k, cm, shift = calibration.displacement.refine(image, *start)
     part = np.clip(shift[:, 2] / np.gradient(calibration.z_um)[k], -0.5, 0.5)
     inner = (k > 0) & (k < last)
     return first + calibration.size // 2 + np.clip(shift[:, :2], -1, 1), k + np.where(inner, part, 0), cm

@@ -6,12 +6,18 @@ Near the pixel and the depth of a template T a window shows
 
 The model is expanded about the template, to first order in dz and to third order in dy and dx. The products that least
 squares needs are prepared for each template, so that a solution costs four products of the window and a few small
-numbers. `Displacement.walk` first climbs to the template, and to the pixel, that fits best (the paper's walking
-procedure). The kernels are compiled (numba).
+numbers. `Displacement.refine` first finds the template, and the pixel, that fits best: by a walk along the stack (the
+paper's walking procedure), which ends at the nearest maximum of C_m. Plain defocus and rings have several, so that
+there, where the stack resembles itself at distant depths (`RISE`), a window is compared with all templates instead. The
+kernels are compiled (numba).
 """
 
+from functools import lru_cache
+
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
 from scipy.ndimage import correlate1d
 
 from gdptlab._compiled import compiled, inlined
@@ -33,6 +39,19 @@ limit ends walks to and fro between two neighbours."""
 AWAY_PX = 0.6
 """Displacement, px, beyond which the walk goes to the next pixel. Derived: more than half a pixel, or particles
 half-way between two pixels would be sent to and fro."""
+
+RISE = 0.3
+"""Rise of the correlation of one template with the others, after its fall, above which a window is compared with all
+templates instead of walking (`largest_rise`)."""
+
+AROUND_PX = 2
+"""Half-width, px, of the square of windows that are compared with all templates."""
+
+PARTS = 10
+"""Number of points in a pixel at which C_m is interpolated."""
+
+RANK_ERROR = 1e-4
+"""Largest part of a template's square that is not in the singular images with which windows are compared."""
 
 
 class Displacement:
@@ -65,6 +84,7 @@ class Displacement:
         self._rows = np.ascontiguousarray(rows, dtype=np.float32)
         self._curved = rows @ curved
         self._templates = np.ascontiguousarray(templates.reshape(count, -1), dtype=np.float32)
+        self._singular = _singular(self._templates) if largest_rise(self._templates) > RISE else None
 
     def __call__(self, image: NDArray[np.float32], first: NDArray, k: NDArray) -> NDArray[np.float64]:
         """Solve for each of some windows.
@@ -88,29 +108,98 @@ class Displacement:
         _solve(image, first.astype(np.int64), k.astype(np.int64), self._rows, self._curved, ROUNDS, shift)
         return shift
 
-    def walk(
+    def refine(
         self, image: NDArray[np.float32], first: NDArray, k: NDArray
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Climb along the templates to the nearest maximum of C_m, and across the pixels to the nearest, then solve.
+        """Find the template and the pixel with the highest C_m, then solve.
+
+        That is the nearest maximum along the templates, and across the pixels, or of all templates, if the stack
+        resembles itself at distant depths.
 
         Parameters
         ----------
         image, first, k
-            As for a call: where the walk begins.
+            As for a call: where the search begins.
 
         Returns
         -------
         first : int array (m, 2)
         k : int array (m,)
         cm : float64 array (m,)
-            Correlation of that window with that template; 0 where the walk leads out of the image.
+            Correlation of that window with that template; 0 where the search leads out of the image.
         shift : float64 array (m, 3)
             As from a call.
         """
+        if self._singular is not None:
+            first, k = self._best(image, first)
         first, k = first.astype(np.int64), k.astype(np.int64)
         cm, shift = np.zeros(len(first)), np.zeros((len(first), 3))
-        _walk(image, first, k, self._templates, self._rows, self._curved, ROUNDS, cm, shift)
+        if self._singular is None:
+            _walk(image, first, k, self._templates, self._rows, self._curved, ROUNDS, cm, shift)
+        else:
+            _measure(image, first, k, self._templates, self._rows, self._curved, ROUNDS, cm, shift)
         return first, k, cm, shift
+
+    def _best(self, image: NDArray[np.float32], first: NDArray) -> tuple[NDArray, NDArray]:
+        """Windows (m, 2) and templates (m,) of the highest C_m, between pixels, about windows at `first` (m, 2)."""
+        n, k, best = int(np.sqrt(self._templates.shape[1])), np.zeros(len(first), np.int64), first.astype(np.int64)
+        last = np.array(image.shape) - n
+        for i in range(len(first)):
+            for _ in range(MOST_WINDOWS // AROUND_PX):
+                at = best[i].copy()
+                low, high = np.maximum(at - AROUND_PX, 0), np.minimum(at + AROUND_PX, last)
+                height, top = _highest(self._compared(image[low[0] : high[0] + n, low[1] : high[1] + n], n))
+                k[i] = height.argmax()
+                best[i] = np.clip(low + np.rint(top[k[i]]).astype(np.int64), 0, last)
+                if (np.abs(best[i] - at) < AROUND_PX).all():
+                    break
+        return best, k
+
+    def _compared(self, part: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+        """C_m of all templates (N, rows - n + 1, columns - n + 1) in a small part of an image (rows, columns)."""
+        windows = sliding_window_view(part - part.mean(), (n, n))
+        shape, windows = windows.shape[:2], windows.reshape(-1, n * n)
+        square = np.einsum("wi,wi->w", windows, windows) - windows.sum(axis=1) ** 2 / (n * n)
+        images, coefficients = self._singular
+        products = coefficients @ (windows @ images).T
+        return (products / np.sqrt(np.where(square > 0, square, np.inf))).reshape(-1, *shape)
+
+
+def largest_rise(templates: NDArray) -> float:
+    """Largest rise of the correlation of one template (N, n * n) with the others, going away from it, after its fall.
+
+    0 if the correlation falls from each template on to both ends of the stack.
+    """
+    similarity, rise = templates @ templates.T, 0.0
+    for k, row in enumerate(similarity):
+        for along in (row[k:], row[k::-1]):
+            rise = max(rise, float((along - np.minimum.accumulate(along)).max()))
+    return rise
+
+
+def _highest(maps: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Largest value (N,) and its row and column (N, 2), between pixels, of each of some small maps."""
+    (down, rows), (across, columns) = (_spline(n) for n in maps.shape[1:])
+    fine = (down @ maps @ across.T).reshape(len(maps), -1)
+    top = fine.argmax(axis=1)
+    y, x = np.unravel_index(top, (len(rows), len(columns)))
+    return fine[np.arange(len(fine)), top], np.stack([rows[y], columns[x]], axis=1)
+
+
+@lru_cache
+def _spline(n: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Matrix (m, n) from n values to their spline, cubic if there are enough, at m points; the points (m,)."""
+    points = np.linspace(0, n - 1, PARTS * (n - 1) + 1)
+    return make_interp_spline(np.arange(n), np.eye(n), k=min(3, n - 1))(points).astype(np.float32), points
+
+
+def _singular(templates: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Leading singular images (n * n, K) of templates (N, n * n), and the templates' coefficients (N, K)."""
+    u, s, images = np.linalg.svd(templates, full_matrices=False)
+    coefficients = u * s
+    left = 1 - np.cumsum(coefficients**2, axis=1).min(axis=0)
+    rank = 1 + int(np.argmax(left < RANK_ERROR))
+    return np.ascontiguousarray(images[:rank].T), np.ascontiguousarray(coefficients[:, :rank])
 
 
 def _difference(images: NDArray, order_y: int, order_x: int) -> NDArray:
@@ -212,3 +301,18 @@ def _walk(image, first, k, templates, rows, curved, rounds, cm, shift):  # pragm
             if top < 0 or left < 0 or top + n > image.shape[0] or left + n > image.shape[1]:
                 cm[i] = 0
                 break
+
+
+@compiled
+def _measure(image, first, k, templates, rows, curved, rounds, cm, shift):  # pragma: no cover
+    """Fill `cm` (m,) and `shift` (m, 3) for the windows at `first` (m, 2), each against its template k."""
+    n = int(np.sqrt(templates.shape[1]))
+    seen = np.empty(n * n, np.float32)
+    for i in range(len(first)):
+        norm = _look(image, first[i, 0], first[i, 1], seen)
+        cm[i] = _dot(templates[k[i]], seen) / norm if norm > 0 else 0
+        _displaced(seen, rows[k[i]], curved[k[i]], rounds, shift[i])
+        for axis in range(2):
+            moved = first[i, axis] + np.sign(shift[i, axis])
+            if abs(shift[i, axis]) > AWAY_PX and (moved < 0 or moved + n > image.shape[axis]):
+                cm[i] = 0

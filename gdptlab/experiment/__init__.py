@@ -25,6 +25,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "watch",
         ],
         "trigger": ["fractions", "in_middle_third", "trigger_time"],
+        "waves": ["WaveMicroscope"],
         "samples": ["make_samples", "sample_scan"],
     },
 )
