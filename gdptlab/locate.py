@@ -10,7 +10,8 @@ By correlation (the paper's section 2):
    the whole profile and Pearson's correlation does not depend on its level. A parabola through the best three gives z
    between slices.
 5. Refinement: the window of the candidate is correlated with templates from that slice onward, uphill along z until C_m
-   no longer rises. Between pixels and slices, x, y and z follow from least squares in that window (`refinement`).
+   no longer rises; with all templates, if the stack resembles itself at distant depths, as rings and plain defocus do.
+   Between pixels and slices, x, y and z follow from least squares in that window (`refinement`).
 6. Of candidates nearer to each other than `min_distance_px` the one with the highest C_m stays.
 
 A particle is measured only if its whole window lies in the frame, so that a border half a template wide stays empty.
@@ -241,7 +242,7 @@ def _pixels(image: NDArray[np.float32], calibration: Calibration, position: NDAr
 def _refined(
     image: NDArray[np.float32], calibration: Calibration, position: NDArray, slice_: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Walk every candidate along the stack and across the pixels to its best C_m (0 if the walk leaves the frame)."""
+    """Bring every candidate to the template and the pixel of its best C_m (0 if that leads out of the frame)."""
     last = len(calibration) - 1
     start = _pixels(image, calibration, position), np.clip(np.rint(slice_), 0, last)
     first, k, cm, shift = calibration.displacement.refine(image, *start)

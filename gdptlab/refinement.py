@@ -42,16 +42,22 @@ half-way between two pixels would be sent to and fro."""
 
 RISE = 0.3
 """Rise of the correlation of one template with the others, after its fall, above which a window is compared with all
-templates instead of walking (`largest_rise`)."""
+templates instead of walking (`largest_rise`). Chosen: our astigmatic stacks rise by 0.22 at most, and a walk ends where
+a comparison does; without a cylindrical lens by 0.32, a measured astigmatic bead by 0.41 to 0.44, rings by up to 1.1,
+beads without astigmatism (planar) by 0.82 to 0.87, where a walk ends at a wrong slice in four of ten windows. A
+comparison takes four times as long as the walk."""
 
 AROUND_PX = 2
-"""Half-width, px, of the square of windows that are compared with all templates."""
+"""Half-width, px, of the square of windows that are compared with all templates. Chosen: with 1, slices of rings
+scatter by up to 1.9 times those of a full comparison; with 3, as with 2."""
 
 PARTS = 10
-"""Number of points in a pixel at which C_m is interpolated."""
+"""Number of points in a pixel at which C_m is interpolated. Derived: the maximum is then off by a twentieth of a pixel,
+which least squares mends."""
 
 RANK_ERROR = 1e-4
-"""Largest part of a template's square that is not in the singular images with which windows are compared."""
+"""Largest part of a template's square that is not in the singular images with which windows are compared. Chosen on 936
+windows of the planar beads: 7 end at a wrong slice, 10 with 1e-3, 58 with 1e-2."""
 
 
 class Displacement:
