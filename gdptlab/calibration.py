@@ -457,6 +457,52 @@ class Calibration:
 
         return calibration_of_labels(frames, table, size=size, n_sub=n_sub)
 
+    @classmethod
+    def from_tilt(
+        cls,
+        frames: ArrayLike,
+        *,
+        tilt_deg: float,
+        um_per_px: float,
+        axis: str = "x",
+        size: int | None = None,
+        n_sub: int | None = None,
+    ) -> Self:
+        """Calibrate without a stage, with beads on a slide that is tilted by a known angle.
+
+        The beads' depths are a plane over the field, z = z_k + tan(tilt) um_per_px (x - x_middle) in frame k. How much
+        higher one frame lies than the first is found from the images; z = 0 is the slide in the middle of the first
+        frame. The tilt gives the scale of z: an error of 1 % in tan(tilt) is one in every depth. What no image tells:
+        the sign of the tilt, which turns z over; a pattern that changes over the field along the axis, which is taken
+        for its change with depth; a focal surface that is tilted or curved, which adds to the slide's plane.
+
+        Parameters
+        ----------
+        frames : array (F, rows, columns)
+            The slide, one frame or several, moved up or down between them by unknown steps such that each shares a
+            third of its depths with those before.
+        tilt_deg : float
+            Angle of the slide, degrees, at most 60 either way; above 0 where depth increases along the axis.
+        um_per_px : float
+            Size of a pixel in the object plane, µm.
+        axis : str
+            "x" or "y": along which the slide rises.
+        size, n_sub : int, optional
+            As in `from_labelled`.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not of that form, or too few beads stand alone.
+        """
+        from gdptlab.pipeline.tilt import calibration_of_tilt
+
+        return calibration_of_tilt(frames, tilt_deg, axis, um_per_px, size=size, n_sub=n_sub)
+
     def __len__(self) -> int:
         return len(self.stack)
 
