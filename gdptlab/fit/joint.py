@@ -70,6 +70,10 @@ WAYS = 8.0
 certainly more than noise the share 1 / WAYS may have moved z. Chosen between 8 and 64 on particles whose diameters
 differ by 10 %, whose errors are 1.3 times the standard deviation with 8, and 3 times with 64."""
 
+LEAST_RETAINED = 1e-4
+"""Least fraction of what the frame tells of a particle that the errors of its neighbours' patterns leave: its standard
+deviations grow a hundredfold at most. Convention."""
+
 UNUSUAL = 3.0
 """Standard deviations by which a particle's amplitude differs from the others' where its variance is twice the usual:
 it may not be alone."""
@@ -353,9 +357,10 @@ class Joint:
         unusual = np.log(amplitude / explained.population.centre) / explained.population.sigma
         beyond = explained.excess - 1
         certain = np.maximum(beyond - 2 * np.sqrt(2 / fit.area), 0)
-        expected = fit.chi2 / np.maximum(explained.excess, 1e-12)  # of noise and the errors of all patterns there
+        weight = explained.variance.weight(fit.image, explained.pixels.valid)
+        retained = self._full.retained(fit, weight, self._full.error_variance(fit.places, self.shape))
         beyond = CORRELATED * np.maximum(beyond, 0) + certain * fit.area / WAYS
-        misfit = np.sqrt(expected + beyond + (unusual / UNUSUAL) ** 2)
+        misfit = np.sqrt(1 / np.maximum(retained, LEAST_RETAINED) + beyond + (unusual / UNUSUAL) ** 2)
         own_error = np.stack([np.interp(slices, at, error) for error in model.own_error.T])
         y_std, x_std, slice_std = np.sqrt(variance).T
         frame_std = x_std, y_std, slice_std * np.interp(slices, at, np.gradient(model.z_um))

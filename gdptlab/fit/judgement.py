@@ -59,18 +59,20 @@ class Level:
         boxes = self.renderer.boxes(places, slices, shape)
         return draw_error(self.error, self.nodes_per_px, places, boxes, slices, shape)
 
-    def gain(self, fit: Fit, weight: NDArray[np.float32], total: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Log-likelihood (P,) that each particle adds beside the others, their patterns' errors of variance `total`.
-
-        What the frame tells of a particle is less, by a factor, where the others' errors add to the noise.
-        """
+    def retained(self, fit: Fit, weight: NDArray[np.float32], total: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Fraction (P,) of what the frame tells of each particle that is left where the errors of the others' patterns,
+        of variance `total` with its own, add to the noise."""
         places, shape = fit.places[fit.order], fit.frame.shape
         slices = self._slices(places, shape)
         sure = np.empty(len(places))
         sure[fit.order] = energy_beside_errors(
             fit.columns, self.error, self.nodes_per_px, places, slices, weight, total
         )
-        return fit.gain * np.minimum(sure / np.maximum(fit.energy, 1e-12), 1) - fit.population.penalty(fit.places[:, 3])
+        return np.minimum(sure / np.maximum(fit.energy, 1e-12), 1)
+
+    def gain(self, fit: Fit, weight: NDArray[np.float32], total: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Log-likelihood (P,) that each particle adds beside the others, their patterns' errors considered."""
+        return fit.gain * self.retained(fit, weight, total) - fit.population.penalty(fit.places[:, 3])
 
     def staying(self, gain: NDArray[np.float64], places: NDArray[np.float64], least: float) -> NDArray[np.bool_]:
         """Which particles stay (P,): all but those that add too little; of neighbours the worst goes first.
