@@ -12,7 +12,7 @@ from gdptlab.pipeline.images import open_images
 # Found and RMSE of z in µm of published methods on the planar beads, by the score of `score`.
 PUBLISHED = {"gdpt": (0.36, 1.66, -0.63), "defocustracker": (0.50, 1.78, -0.47), "idpt": (0.95, 0.67, 0.05)}
 # Of ours, with one calibration bead: fraction found, at least, and RMSE of z in µm, at most.
-FOUND, RMSE_UM = 0.45, 1.6
+FOUND, RMSE_UM = 0.6, 1.7
 
 
 @pytest.mark.parametrize("image_type", IMAGE_TYPES)

@@ -50,6 +50,14 @@ for (row, column), (k, z) in itertools.product(CENTRES, enumerate(DEPTHS)):
     SCAN[k, row - 4 : row + 5, column - 4 : column + 5] += disc(z)
 
 
+LABELS = pd.DataFrame(
+    [(k, x, y, RNG.uniform(-3, 3)) for k in range(2) for x in range(12, 110, 20) for y in range(12, 110, 20)],
+    columns=["frame", "x_px", "y_px", "z_um"],
+)
+LABELLED = RNG.normal(0, 0.01, (2, 120, 120))
+for label in LABELS.astype({"frame": int, "x_px": int, "y_px": int}).itertuples():
+    LABELLED[label.frame, label.y_px - 4 : label.y_px + 5, label.x_px - 4 : label.x_px + 5] += disc(label.z_um)
+
 BEADS = pd.DataFrame({"x_px": [9.0, 30, 50, 10, 28, 52], "y_px": [8.0, 9, 11, 40, 45, 38], "offset_um": 0.1})
 REPORT = SimpleNamespace(beads=BEADS.assign(verdict="used"), drift_px=np.zeros((9, 2)), clipped=np.zeros(9), noise=0.1)
 TILTED = replace(CALIBRATION, report=REPORT)
@@ -128,6 +136,7 @@ def calls(folder: Path) -> dict[str, Call]:
         "gdptlab.Calibration.from_stack": call(Calibration.from_stack, stack=STACK, z_um=Z_UM, n_sub=3),
         "gdptlab.Calibration.from_bead": call(Calibration.from_bead, "stack", **beads, x_px=26.0, y_px=26.0, n_sub=3),
         "gdptlab.Calibration.from_scan": call(Calibration.from_scan, **beads, beads_px=CENTRES, n_sub=3),
+        "gdptlab.Calibration.from_labelled": call(Calibration.from_labelled, frames=LABELLED, table=LABELS, size=9),
         "gdptlab.Calibration.with_subset": call(CALIBRATION.with_subset, n_sub=3),
         "gdptlab.Calibration.with_depth_factor": call(CALIBRATION.with_depth_factor, factor=1.33),
         "gdptlab.Calibration.with_depth_error": call(CALIBRATION.with_depth_error, std_um=0.5),
@@ -163,6 +172,7 @@ def calls(folder: Path) -> dict[str, Call]:
         "experiment.Focusing.trigger_time": call(FOCUSING.trigger_time, axis="y"),
         "experiment.Method": call(Method, evaluator=ten, **made, settings={"threshold": 0.5}, label={"a": 1}),
         "experiment.Microscope": call(Microscope),
+        "experiment.WaveMicroscope": call(experiment.WaveMicroscope),
         "experiment.Microscope.render": call(optics.render, particles=particles, shape=(20, 30)),
         "experiment.Microscope.light": call(optics.light, particles=particles, shape=(20, 30)),
         "experiment.Microscope.stack": call(optics.stack, "particles", z_um=[-1.0, 0.0, 1.0], size=9),
