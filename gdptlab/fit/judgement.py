@@ -60,8 +60,10 @@ class Level:
         return draw_error(self.error, self.nodes_per_px, places, boxes, slices, shape)
 
     def retained(self, fit: Fit, weight: NDArray[np.float32], total: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Fraction (P,) of what the frame tells of each particle that is left where the errors of the others' patterns,
-        of variance `total` with its own, add to the noise."""
+        """Fraction (P,) of each particle's energy that the errors of the others' patterns leave.
+
+        They add to the noise; `total` is the variance of the errors of all patterns, its own as well.
+        """
         places, shape = fit.places[fit.order], fit.frame.shape
         slices = self._slices(places, shape)
         sure = np.empty(len(places))

@@ -193,9 +193,9 @@ def _must_fit(coarse: Labelled, frames: NDArray[np.float32], table: pd.DataFrame
         if (fraction := float(np.median(labelled.explained()))) > best:
             said, best = f"; {100 * fraction:.0f} % would be, if {name}", fraction
     if said or explained < EXPLAINED:
+        needed = said or f", needed are {100 * EXPLAINED:.0f} %"
         raise ValueError(
-            f"table: got labels by which {100 * explained:.0f} % of the light in a frame are explained, needed are "
-            f"{100 * EXPLAINED:.0f} %{said}"
+            f"table: got labels by which {100 * explained:.0f} % of the light in a frame are explained{needed}"
         )
 
 
