@@ -167,3 +167,8 @@ def test_light_beyond_the_frame_is_about_what_was_cut_off(microscope):
     total, cut, drawn = (a.sum(axis=(1, 2)) for a in (whole, whole[:, 30:-30, 30:-30], images))
     assert (total / cut)[-1] > 1.1
     np.testing.assert_allclose(drawn / total, 1, atol=0.02)
+
+
+def test_noise_beyond_any_camera_is_refused(calibration):
+    with pytest.raises(ValueError, match=r"^noise: "):
+        expected_error(calibration, noise=1e308)

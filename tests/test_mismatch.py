@@ -104,5 +104,7 @@ def test_bad_frames(calibration, bad):
 def test_bad_errors(calibration):
     with pytest.raises(ValueError, match="std_um"):
         calibration.with_depth_error(-1.0)
+    with pytest.raises(ValueError, match="mismatch"):
+        mismatch_error_um(mismatch_of([3.0, 3.0, 3.0]).assign(z_error_um=1e308))
     with pytest.raises((TypeError, ValueError), match="mismatch"):
         mismatch_error_um(pd.DataFrame({"n": [1]}))

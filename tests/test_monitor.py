@@ -934,3 +934,8 @@ def test_a_partial_function_is_an_evaluator(few, calibration):
     frame, particles = few
     monitor = through([frame], partial(locate, calibration=calibration))
     assert len(monitor.latest.table) == len(particles)
+
+
+def test_a_log_is_no_folder(tmp_path):
+    with pytest.raises(ValueError, match=r"^path: .*folder"):
+        Logbook(tmp_path)

@@ -470,8 +470,18 @@ def errors(
     positive("limit_s", limit_s)
     if tau_s is not None:
         _one_axis("tau_s", tau_s)
-    columns = ["frame", "t_s", "fraction_h", "fraction_w", "true_fraction_h", "true_fraction_w", "level"]
-    check_table("table", table, [*columns, "true_h_s", "true_w_s"])
+    columns = [
+        "frame",
+        "t_s",
+        "fraction_h",
+        "fraction_w",
+        "true_fraction_h",
+        "true_fraction_w",
+        "level",
+        "true_h_s",
+        "true_w_s",
+    ]
+    table = check_table("table", table, columns).astype(dict.fromkeys(columns[1:], float))
     if tau_s is None and "tau_s" not in table:
         raise ValueError("tau_s: got None, allowed is a number above 0 where the table has no column tau_s")
     keys = [name for name in table.columns[: table.columns.get_loc("frame")] if name != "tau_s"]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.ndimage import spline_filter1d, uniform_filter1d
 
-from gdptlab._checks import positive
+from gdptlab._checks import numbers, positive
 from gdptlab.calibration import Calibration
 from gdptlab.denoising import denoised, noise_line
 from gdptlab.fit.pattern import particle_light
@@ -122,7 +122,7 @@ def expected_error(
     if noise is None:
         variance = level + slope * (smooth - light)
     else:
-        variance, slope = np.full(light.shape, positive("noise", noise) ** 2), 0.0
+        variance, slope = np.full(light.shape, numbers("noise", positive("noise", noise)) ** 2), 0.0
     if electrons_per_count is None:
         variance += slope * amplitude * light
     else:

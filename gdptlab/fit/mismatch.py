@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
-from gdptlab._checks import image_array, iterable, table
+from gdptlab._checks import image_array, iterable, numbers, table
 from gdptlab.calibration import Calibration, checked
 from gdptlab.fit.frames import explained
 from gdptlab.fit.model import ERROR_SCALE_PX, PatternModel, field_terms
@@ -112,7 +112,7 @@ def mismatch_error_um(mismatch: pd.DataFrame) -> float:
     known = table("mismatch", mismatch, columns)[columns].dropna()
     if not (known["significance"] > SURE).any():
         return 0.0
-    return float(np.sqrt(np.square(known["z_error_um"]).mean()))
+    return float(np.sqrt(np.square(numbers("mismatch", known["z_error_um"])).mean()))
 
 
 def _add(frame: NDArray[np.float32], calibration: Calibration, edges: NDArray, sums: NDArray, n: NDArray) -> None:

@@ -64,6 +64,8 @@ class Logbook:
     def __init__(self, path: str | os.PathLike[str], *, most: int = 10_000) -> None:
         self.run, self.written, self.lost, self.problem, self._appended = uuid4().hex[:12], 0, 0, "", 0
         self._most, self._path = whole("most", most, 1, 2**31), check_path("path", path)
+        if self._path.is_dir():
+            raise ValueError(f"path: got {path}, a folder, allowed is a file")
         self._lines: deque[bytes] = deque()
         self._changed, self._closing = Condition(), False
         self._open()
