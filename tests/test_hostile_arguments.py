@@ -423,7 +423,8 @@ UNNAMED = {
 
 
 @pytest.mark.parametrize("name", calls(Path("absent")))
-def test_works_or_names_an_argument(name, folder):
+def test_works_or_names_an_argument(name, folder, monkeypatch):
+    monkeypatch.chdir(folder)  # where what has a spoilt path may be written
     one = calls(folder)[name]
     one.function(**one.good)
 

@@ -116,17 +116,17 @@ def expected_error(
     TypeError, ValueError
         If an argument is no number above 0.
     """
-    amplitude, light = positive("amplitude", amplitude), particle_light(calibration)
+    amplitude, light = _usual("amplitude", amplitude), particle_light(calibration)
     smooth = denoised(calibration.stack)
     slope, level = noise_line(calibration.stack - smooth, smooth)
     if noise is None:
         variance = level + slope * (smooth - light)
     else:
-        variance, slope = np.full(light.shape, numbers("noise", positive("noise", noise)) ** 2), 0.0
+        variance, slope = np.full(light.shape, _usual("noise", noise) ** 2), 0.0
     if electrons_per_count is None:
         variance += slope * amplitude * light
     else:
-        variance += amplitude * np.abs(light) / positive("electrons_per_count", electrons_per_count)
+        variance += amplitude * np.abs(light) / _usual("electrons_per_count", electrons_per_count)
     weight = (amplitude**2 / np.maximum(variance, LEAST_NOISE**2)).reshape(len(light), -1, 1)
     columns = derivatives(light, calibration.z_um)
     fisher = columns.transpose(0, 2, 1) @ (weight * columns)
@@ -139,6 +139,11 @@ def expected_error(
     return pd.DataFrame(np.sqrt([v[:3] for v in variances]), columns=names).assign(z_um=calibration.z_um)[
         ["z_um", *names]
     ]
+
+
+def _usual(name: str, value: float) -> float:
+    """Return a number above 0 whose square a computer can hold."""
+    return float(numbers(name, positive(name, value), 1e-12, 1e12))
 
 
 def _without_noise(fisher: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
