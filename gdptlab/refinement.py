@@ -44,8 +44,8 @@ RISE = 0.3
 """Rise of the correlation of one template with the others, after its fall, above which a window is compared with all
 templates instead of walking (`largest_rise`). Chosen: our astigmatic stacks rise by 0.22 at most, and a walk ends where
 a comparison does; without a cylindrical lens by 0.32, a measured astigmatic bead by 0.41 to 0.44, rings by up to 1.1,
-beads without astigmatism (planar) by 0.82 to 0.87, where a walk ends at a wrong slice in four of ten windows. A
-comparison takes four times as long as the walk."""
+beads without astigmatism (planar) by 0.82 to 0.87, where a walk ends at a wrong slice in four of ten windows. By
+comparison a frame takes some four times as long."""
 
 AROUND_PX = 2
 """Half-width, px, of the square of windows that are compared with all templates. Chosen: with 1, slices of rings

@@ -325,7 +325,7 @@ def _draw(nodes, frame, places, fine, half, out):  # pragma: no cover
     """Add the images of particles to `out`: along z, then y, then x.
 
     The renderer itself takes patterns, not nodes, and its supports change with the amplitude, so that it has no
-    transpose in the nodes, and drawing with it takes 4 to 5 times as long, as each step needs it anew.
+    transpose in the nodes.
     """
     levels, m, one = nodes.shape[0], nodes.shape[1], np.float32(1)
     plane, line = np.empty((m, m), np.float32), np.empty(m, np.float32)

@@ -58,10 +58,7 @@ def calibration_of_labels(
 ) -> Calibration:
     """Calibrate with labelled particles; see `Calibration.from_labelled`."""
     frames, table = checked_labels(frames, table)
-    if size is not None and whole("size", size, 5, min(frames.shape[1:])) % 2 == 0:
-        raise ValueError(f"size: got {size} px, allowed are odd sizes")
-    if n_sub is not None:
-        whole("n_sub", n_sub, 2, SLICES[1])
+    check_sizes(size, n_sub, frames.shape[1:])
     z_um = _slices(table["z_um"].to_numpy())
     coarse = _coarse(frames, table)
     _must_fit(coarse, frames, table)
@@ -70,6 +67,14 @@ def calibration_of_labels(
     labelled.learn()
     _must_be_centred(labelled)
     return calibration_of(labelled, z_um, n_sub)
+
+
+def check_sizes(size: int | None, n_sub: int | None, shape: tuple[int, int]) -> None:
+    """Check rows and columns of a template, and the number of images of the subset, where they are given."""
+    if size is not None and whole("size", size, 5, min(shape)) % 2 == 0:
+        raise ValueError(f"size: got {size} px, allowed are odd sizes")
+    if n_sub is not None:
+        whole("n_sub", n_sub, 2, SLICES[1])
 
 
 def calibration_of(labelled: Labelled, z_um: NDArray[np.float64], n_sub: int | None) -> Calibration:

@@ -10,12 +10,12 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import median_abs_deviation
 
-from gdptlab._checks import choice, number, positive, real_array, whole
+from gdptlab._checks import choice, number, positive, real_array
 from gdptlab._compiled import on_one_core
 from gdptlab.calibration import Calibration
 from gdptlab.locate import batch
 from gdptlab.pipeline.image_curve import features
-from gdptlab.pipeline.labels import LEAST, SLICES, calibration_of_labels
+from gdptlab.pipeline.labels import LEAST, calibration_of_labels, check_sizes
 from gdptlab.pipeline.lone_images import lone_images
 
 STEEPEST_DEG = 60.0
@@ -46,10 +46,7 @@ def calibration_of_tilt(
     choice("axis", axis, ("x", "y"))
     if not 0 < abs(number("tilt_deg", tilt_deg)) <= STEEPEST_DEG:
         raise ValueError(f"tilt_deg: got {tilt_deg:g}, allowed is 0 to {STEEPEST_DEG:g} either way, but not 0")
-    if size is not None and whole("size", size, 7, min(frames.shape[1:])) % 2 == 0:
-        raise ValueError(f"size: got {size} px, allowed are odd sizes")
-    if n_sub is not None:
-        whole("n_sub", n_sub, 2, SLICES[1])
+    check_sizes(size, n_sub, frames.shape[1:])
     slope = np.tan(np.deg2rad(tilt_deg)) * positive("um_per_px", um_per_px)
     lone = lone_images(frames, size)
     if len(lone.table) < LEAST:
