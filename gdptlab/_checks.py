@@ -44,6 +44,17 @@ def positive(name: str, value: Any, *, zero: bool = False, infinite: bool = Fals
     return float(value)
 
 
+def depth_factor(name: str, value: Any) -> float:
+    """Return depth over travel, 0.1 to 10, from it or from the refractive indices (immersion, sample)."""
+    if isinstance(value, tuple | list):
+        if len(value) != 2:
+            raise ValueError(f"{name}: got {value!r}, allowed are two refractive indices: immersion, sample")
+        value = positive(name, value[1]) / positive(name, value[0])
+    if not 0.1 <= positive(name, value) <= 10:
+        raise ValueError(f"{name}: got {value:g}, allowed is 0.1 to 10")
+    return float(value)
+
+
 def rate(name: str, value: Any) -> float:
     """Return `value` as a float if it is a number of frames in a second, 1e-9 to 1e9."""
     if not 1e-9 <= positive(name, value) <= 1e9:
@@ -156,7 +167,7 @@ def table(name: str, value: Any, columns: Iterable[str]) -> pd.DataFrame:
     if missing:
         raise ValueError(f"{name}: got no column {missing}, needed are {', '.join(map(str, columns))}")
     for column in [*columns, *({"frame"} & set(value))]:
-        if len(value) and value[column].dtype.kind not in "buif":  # without rows a table often has no types
+        if value[column].dtype.kind not in ("buif" if len(value) else "buifO"):  # without rows often without a type
             raise TypeError(f"{name}: got {column} of type {value[column].dtype}, allowed are real numbers")
     return value
 

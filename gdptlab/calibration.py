@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from gdptlab._checks import choice, depths, flag, image_array, instance, positive, whole
+from gdptlab._checks import choice, depth_factor, depths, flag, image_array, instance, positive, whole
 from gdptlab._compiled import on_one_core
 from gdptlab._plans import planned
 from gdptlab.correlation import Correlator, normalised
@@ -161,14 +161,9 @@ class Calibration:
         >>> calibration.with_depth_factor((1.0, 1.33)).z_um
         array([0.  , 1.33, 2.66])
         """
-        if isinstance(factor, tuple | list):
-            if len(factor) != 2:
-                raise ValueError(f"factor: got {factor!r}, allowed are two refractive indices: immersion, sample")
-            factor = positive("factor", factor[1]) / positive("factor", factor[0])
-        if not 0.1 <= positive("factor", factor) <= 10:
-            raise ValueError(f"factor: got {factor:g}, allowed is 0.1 to 10")
+        factor = depth_factor("factor", factor)
         ratio = factor / self.depth_factor
-        changes: dict[str, Any] = {"z_um": self.z_um * ratio, "depth_factor": float(factor)}
+        changes: dict[str, Any] = {"z_um": self.z_um * ratio, "depth_factor": factor}
         if self.learned is not None:
             changes["learned"] = replace(
                 self.learned,

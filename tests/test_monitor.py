@@ -796,6 +796,7 @@ def test_a_process_of_its_own_may_die(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="an interrupt of one process only")
 def test_after_an_interrupt_no_frame_gets_the_answer_of_another():
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # not there if the shell ignores it for its own reasons
     with OwnProcess(dies) as evaluate:
         evaluate(image(0.1))
         threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()

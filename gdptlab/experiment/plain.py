@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from skimage.feature import match_template
 
-from gdptlab._checks import choice
+from gdptlab._checks import choice, flag
 from gdptlab.calibration import Calibration
 from gdptlab.correlation import standardised, strongest, vertex
 from gdptlab.locate import as_table, checked_frame
@@ -79,7 +79,7 @@ def locate_plainly(
     correlation = standardised(maps[:, row, column].T) @ standardised(expected).T
     k = np.clip(correlation.argmax(axis=1), 1, last - 1)
     slice_ = k + vertex(correlation[np.arange(len(k))[:, None], k[:, None] + (-1, 0, 1)])
-    if refine:
+    if flag("refine", refine):
         starts = zip(row, column, np.rint(slice_).astype(int), strict=True)
         found = [_climbed(image, templates, *start, correlated) for start in starts]
     else:

@@ -416,6 +416,11 @@ def expected_delay(tau_s: ArrayLike, camera_s: float = 0.04, truth_s: float | No
     -------
     DataFrame
         `tau_s`; `mean_s`, `low_s` and `high_s`: mean, smallest and largest delay of the frame's timestamp.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not of that form, or times are more than 1e9 times as long as others.
     """
     tau = _one_axis("tau_s", tau_s)
     for value in tau.tolist():
@@ -424,6 +429,10 @@ def expected_delay(tau_s: ArrayLike, camera_s: float = 0.04, truth_s: float | No
     fine = d if truth_s is None else positive("truth_s", truth_s)
     if not fine * 1e9 > d or abs(d / fine - round(d / fine)) > 1e-6 or round(d / fine) < 1:
         raise ValueError(f"truth_s: got {fine:g}, allowed is a whole part of camera_s = {d:g}")
+    if not tau.max() <= 1e9 * d:
+        raise ValueError(
+            f"camera_s: got {d:g}, allowed is at least 1e-9 of tau_s, of which the longest is {tau.max():g}"
+        )
     full = np.floor(tau / d + 1e-9)  # steps of the staircase d floor(U / d) that are whole
     mean = d * (full * (full - 1) / 2 * d + full * np.maximum(tau - full * d, 0)) / tau
     high = d * np.maximum(np.ceil(tau / d - 1e-9) - 1, 0)

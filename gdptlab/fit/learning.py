@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from scipy.stats import median_abs_deviation
 from skimage.registration import phase_cross_correlation
 
-from gdptlab._checks import real_array, whole
+from gdptlab._checks import depths, flag, numbers, real_array, whole
 from gdptlab._compiled import compiled, on_one_core
 from gdptlab.denoising import noise_level, noise_line
 from gdptlab.fit.background import Background
@@ -125,18 +125,21 @@ def learned(
         If an argument is not of that form, there are fewer particles than `field` and `modes` need, or the particles
         do not stay in place.
     """
-    scan, beads_px = real_array("scan", scan, 3).astype(np.float32), real_array("beads_px", beads_px, 2)
-    steps = np.diff(np.asarray(z_um, dtype=float))
+    scan, beads_px = real_array("scan", scan, 3), _beads("beads_px", beads_px, np.shape(scan))
+    steps = np.diff(depths("z_um", z_um))
     if len(steps) != len(scan) - 1 or len(scan) < 8:
         raise ValueError(f"z_um: got {len(steps) + 1} depths for {len(scan)} frames, needed are as many, 8 or more")
     if steps.min() <= 0 or np.ptp(steps) > 0.1 * steps.mean():
         raise ValueError(f"z_um: got steps from {steps.min():g} to {steps.max():g} µm, allowed are even ones above 0")
+    if np.ptp(scan) == 0:
+        raise ValueError("scan: got frames without contrast, allowed are images of particles")
     size = _median_size(scan, beads_px) if size is None else whole("size", size, 5, min(scan.shape[1:]))
     if size % 2 == 0:
         raise ValueError(f"size: got {size}, allowed are odd numbers")
+    whole("turns", turns, 1, 100)
     learning = _Learning(scan, beads_px[:, ::-1].astype(float), size // 2, _chosen(scan, beads_px, size, learn_from))
     count = int(learning.chosen.sum())
-    field = count >= PARTICLES_FOR_FIELD if field is None else field
+    field = count >= PARTICLES_FOR_FIELD if field is None else flag("field", field)
     modes = min(MODES, count // PARTICLES_PER_MODE) if modes is None else whole("modes", modes, 0, 100)
     needed = max(10 if field else 1, 4 * modes)
     if count < needed:
@@ -158,6 +161,16 @@ def learned(
         learning.learn_places()
     learning.learn_patterns()
     return learning.model(np.asarray(z_um, dtype=float)), learning.beads(steps.mean())
+
+
+def _beads(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return `value` as places (P, 2) in frames of a scan of `shape`."""
+    places = numbers(name, value)
+    if places.ndim != 2 or places.shape[1] != 2 or not len(places):
+        raise ValueError(f"{name}: got shape {places.shape}, allowed are x and y of one bead or more, (P, 2)")
+    if ((places < 0) | (places > np.array(shape[:0:-1]) - 1)).any():
+        raise ValueError(f"{name}: got beads outside the frames, allowed are those within {shape[2]} by {shape[1]} px")
+    return places
 
 
 def _chosen(scan: NDArray, beads_px: NDArray, size: int, learn_from: ArrayLike | None) -> NDArray[np.bool_]:

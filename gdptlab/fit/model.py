@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
+from gdptlab._checks import numbers, pair
 from gdptlab.calibration import Calibration
 from gdptlab.correlation import normalised
 from gdptlab.denoising import noise_level
@@ -35,11 +36,19 @@ LOSSLESS = 0.98
 
 
 def field_terms(x_px: ArrayLike, y_px: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Terms 1, x, y, r^2 of smooth functions over frames of `shape`, (..., 4); each about -1 to 1."""
-    rows, columns = shape
+    """Terms 1, x, y, r^2 of smooth functions over frames of `shape`, (..., 4); each about -1 to 1.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If x_px and y_px are not finite numbers, as many of both, or shape is not (rows, columns).
+    """
+    rows, columns = pair("shape", shape)
+    x_px, y_px = numbers("x_px", x_px), numbers("y_px", y_px)
+    if x_px.shape != y_px.shape:
+        raise ValueError(f"x_px: got shape {x_px.shape}, allowed is that of y_px, {y_px.shape}")
     half = max(shape) / 2
-    u = (np.asarray(x_px, dtype=float) - (columns - 1) / 2) / half
-    v = (np.asarray(y_px, dtype=float) - (rows - 1) / 2) / half
+    u, v = (x_px - (columns - 1) / 2) / half, (y_px - (rows - 1) / 2) / half
     square = ((rows / 2 / half) ** 2 + (columns / 2 / half) ** 2) / 3  # the mean of r^2 over the frame
     return np.stack([np.ones_like(u), u, v, u**2 + v**2 - square], axis=-1)
 

@@ -3,11 +3,15 @@
 import numpy as np
 import pandas as pd
 
+from gdptlab._checks import positions
 from gdptlab._checks import table as check_table
 from gdptlab.fit.joint import AMBIGUOUS
 
 PLANE_UM = 1.0
 """Standard deviation, in um, of depths about the plane."""
+
+DEEPEST_UM = 5000.0
+"""Largest difference of depths, um. Convention: beyond the reach of any microscope."""
 
 
 def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
@@ -29,14 +33,18 @@ def decided_by_plane(table: pd.DataFrame) -> pd.DataFrame:
 
     Raises
     ------
-    ValueError
-        If a column is missing.
+    TypeError, ValueError
+        If a column is missing, a depth is NaN or depths differ by more than 5 mm.
     """
-    check_table("table", table, ["z_um", "z_other_um", "log_ratio"])
-    depths = table[["z_um", "z_other_um"]].to_numpy(copy=True)
+    check_table("table", positions("table", table, ["z_um"]), ["z_other_um", "log_ratio"])
+    depths = table[["z_um", "z_other_um"]].to_numpy(dtype=float, copy=True)
     depths[:, 1] = np.where(np.isfinite(depths[:, 1]), depths[:, 1], depths[:, 0])  # one depth only: it is both
     if not len(depths):
         return table.copy()
+    if np.ptp(depths) > DEEPEST_UM:
+        raise ValueError(
+            f"table: got depths from {depths.min():g} to {depths.max():g} µm, allowed are 5 mm between them"
+        )
     planes = np.arange(depths.min(), depths.max() + 0.1, 0.1)
     off = np.minimum((depths - planes[:, None, None]) ** 2 / PLANE_UM**2, 9) / 2
     off[:, :, 1] += np.clip(table["log_ratio"].to_numpy(), -AMBIGUOUS, AMBIGUOUS)

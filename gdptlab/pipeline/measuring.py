@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
+from gdptlab._checks import depth_factor as check_depth_factor
 from gdptlab._checks import flag, number, positive, whole
 from gdptlab._checks import path as check_path
 from gdptlab._files import keep_arrays, kept_arrays, sources_folder, written_whole
@@ -173,6 +174,8 @@ def measure(
     film = open_images(frames)
     um_per_px = _um_per_px(um_per_px, film, scanned)
     folder = _folder(folder, frames)
+    if depth_factor is not None:
+        depth_factor = check_depth_factor("depth_factor", depth_factor)
     given = {"z_um": z_um, "um_per_px": um_per_px, "frame_rate_hz": frame_rate_hz, "search_range_um": search_range_um}
     given |= {"depth_factor": depth_factor, "side": side, "flat_field": flag("flat_field", flat_field)}
     if prepare is not None:

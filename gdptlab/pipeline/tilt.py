@@ -47,7 +47,9 @@ def calibration_of_tilt(
     if not 0 < abs(number("tilt_deg", tilt_deg)) <= STEEPEST_DEG:
         raise ValueError(f"tilt_deg: got {tilt_deg:g}, allowed is 0 to {STEEPEST_DEG:g} either way, but not 0")
     check_sizes(size, n_sub, frames.shape[1:])
-    slope = np.tan(np.deg2rad(tilt_deg)) * positive("um_per_px", um_per_px)
+    if not 1e-4 <= positive("um_per_px", um_per_px) <= 1e4:
+        raise ValueError(f"um_per_px: got {um_per_px:g}, allowed is 1e-4 to 1e4")
+    slope = np.tan(np.deg2rad(tilt_deg)) * um_per_px
     lone = lone_images(frames, size)
     if len(lone.table) < LEAST:
         raise ValueError(
@@ -60,10 +62,20 @@ def calibration_of_tilt(
         size = lone.images.shape[-1]  # their surroundings, which are empty
     table["z_um"] += offset[table["frame"]]
     for _ in range(ROUNDS):
-        calibration = calibration_of_labels(frames, table, size=size)
+        calibration = _calibrated(frames, table, size, None)
         found = batch(frames, calibration, method="joint", progress=False, n_jobs=1)
         table = _labels(found, _plane(found, axis, slope, frames.shape[1:]))
-    return calibration_of_labels(frames, table, size=size, n_sub=n_sub)
+    return _calibrated(frames, table, size, n_sub)
+
+
+def _calibrated(frames: NDArray[np.float32], table: pd.DataFrame, size: int, n_sub: int | None) -> Calibration:
+    """Calibrate with labels; what is wrong with them is wrong with the frames."""
+    try:
+        return calibration_of_labels(frames, table, size=size, n_sub=n_sub)
+    except ValueError as error:
+        raise ValueError(
+            f"frames: got {len(table)} beads on the plane of this tilt that do not fit: {error}"
+        ) from error
 
 
 def _plane(table: pd.DataFrame, axis: str, slope: float, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -105,6 +117,8 @@ def _labels(found: pd.DataFrame, plane_um: NDArray[np.float64]) -> pd.DataFrame:
     """Labels from what was measured, each frame's on its plane, the first frame's through 0."""
     off = found["z_um"] - plane_um
     offset = off.groupby(found["frame"]).median()
+    if 0 not in offset:
+        raise ValueError("frames: got a first frame in which no bead is like those that stand alone, needed are some")
     off -= found["frame"].map(offset)
     most = max(OFF_PLANE * median_abs_deviation(off, scale="normal"), LEAST_OFF * np.ptp(plane_um))
     z_um = plane_um + found["frame"].map(offset - offset.iloc[0])
