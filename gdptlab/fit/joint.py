@@ -343,7 +343,8 @@ class Joint:
             around it, over the variance; `chi2_without`, the same were the particle removed; `z_other_um`, the best
             depth on the other side of focus, NaN where there is none; `log_ratio`, the logarithm of the likelihood of
             the first depth over that of the second, infinity where there is none; `ambiguous`, whether that is below
-            `AMBIGUOUS`. `attrs` counts the pixels left out, `saturated_px` and `defective_px`, and the rows kept out, `foreign`.
+            `AMBIGUOUS`. `attrs` counts the pixels left out, `saturated_px` and `defective_px`, and the rows kept out,
+            `foreign`.
         """
         fit, model = explained.fit, self.model
         y, x, slices, amplitude = fit.places[:, :4].T
