@@ -20,6 +20,7 @@ from gdptlab.fit.depths import Alone, Trials
 from gdptlab.fit.judgement import LEAST_GAIN, Level, learned_population
 from gdptlab.fit.model import PatternModel, field_terms
 from gdptlab.fit.noise import Pixels, Variance, learned_variance, usable_pixels
+from gdptlab.fit.pairs import split
 from gdptlab.fit.renderer import Renderer
 from gdptlab.fit.search import MatchedFilter
 from gdptlab.fit.solver import Fit, Population, fitted
@@ -175,7 +176,7 @@ class Joint:
         pixels = usable_pixels(frame)
         frame = self._normalised(pixels)
         places, population, surface = self._search(frame, pixels)
-        variance, background = Variance(), None
+        variance, background, tried = Variance(), None, False
         weight = variance.weight(np.zeros_like(frame), pixels.valid)
         for again in range(REFITS):
             fit = self._fitted(frame, places, weight, population, surface, background, STEPS)
@@ -184,7 +185,11 @@ class Joint:
             stays = self._full.staying(gain, fit.places, LEAST_GAIN)
             excess = self._full.excess(fit, weight, total)
             settled = stays.all() and len(self._full.merged(fit.places, excess)) == len(fit.places)
-            if again and settled:
+            two, pairs = np.zeros(len(stays), bool), fit.places[:0]
+            if not tried and again and (settled or again == REFITS - 2):
+                two, pairs = split(self._full, fit, stays, weight, total)
+                tried = True
+            if again and settled and not len(pairs):
                 break
             population, background = learned_population(fit, stays, population), fit.background
             new = self._unexplained(fit, weight, total, population) if again < 2 else places[:0]
@@ -193,7 +198,8 @@ class Joint:
             if again == 0 and (suits := self._suits(frame - fit.image, weight)) != surface:
                 surface, background = suits, None
             likelier = self._likelier(fit, variance, pixels)
-            places = np.concatenate([self._full.merged(likelier[stays], excess[stays]), new])
+            kept = stays & ~two
+            places = np.concatenate([self._full.merged(likelier[kept], excess[kept]), pairs, new])
         velocity = np.zeros((len(fit.places), 3))
         return Explained(fit, stays, fit.places, velocity, population, surface, variance, pixels, gain, excess)
 
