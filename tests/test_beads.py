@@ -231,7 +231,10 @@ def flowing(radius, speed, n=16):
 
 
 @pytest.mark.parametrize("field", [False, True])
-@pytest.mark.parametrize(("radius", "speed"), [((20, 60, 60, 95, 95), 0.02), ((30, 80, 80, 60), 0.5), ((60,), 0.03)])
+@pytest.mark.parametrize(
+    ("radius", "speed"),
+    [((20, 60, 60, 95, 95), 0.02), ((20, 60, 60, 95, 95), 0.01), ((30, 80, 80, 60), 0.5), ((60,), 0.03)],
+)
 def test_a_film_is_no_scan(radius, speed, field) -> None:
     film = flowing(np.array(radius, dtype=float), speed)
     with pytest.raises(ValueError, match=r"^scan: .*film of particles that flow"):

@@ -119,6 +119,20 @@ def test_a_film_given_as_a_scan_is_refused(folder, capsys):
     assert leaving.value.code == 2 and "film of particles that flow" in capsys.readouterr().err
 
 
+def test_a_call_that_was_refused_leaves_the_folder_to_the_next(folder, tmp_path, capsys):
+    """A film taken for the scan, then the right way round: it need not be another folder."""
+    asked = ["--um-per-px", str(UM_PER_PX), "--rate", str(RATE), "--size", "31", "--out", str(tmp_path / "results")]
+    with pytest.raises(SystemExit):
+        main(["measure", str(folder / "film.tif"), str(folder / "film.tif"), "--z", "-30", "30", *asked])
+    assert main(["measure", str(folder / "scan"), str(folder / "film.tif"), "--method", "correlation", *asked]) == 0
+    assert str(tmp_path / "results" / "field.vtr") in capsys.readouterr().out
+
+
+def test_depths_that_are_missing_are_asked_for_by_their_name(folder):
+    with pytest.raises(ValueError, match=r"^z_um: got none"):
+        measure(folder / "film.tif", folder / "film.tif", um_per_px=UM_PER_PX)
+
+
 def test_what_is_in_the_folder(folder, measured):
     names = {path.name for path in measured.folder.iterdir()}
     assert names == {
