@@ -11,7 +11,7 @@ import pytest
 import tifffile
 
 from gdptlab import Calibration
-from gdptlab.__main__ import main
+from gdptlab.__main__ import ROOT, main
 from gdptlab.assessment import match
 from gdptlab.pipeline import measure
 from gdptlab.pipeline.command import BAD
@@ -117,6 +117,37 @@ def test_a_film_given_as_a_scan_is_refused(folder, capsys):
     with pytest.raises(SystemExit) as leaving:
         main(["measure", str(folder / "film.tif"), str(folder / "film.tif"), "--z", "0", "30", "--size", "31"])
     assert leaving.value.code == 2 and "film of particles that flow" in capsys.readouterr().err
+
+
+def test_a_call_that_was_refused_leaves_the_folder_to_the_next(folder, tmp_path, capsys):
+    """A film taken for the scan, then the right way round: it need not be another folder."""
+    asked = ["--um-per-px", str(UM_PER_PX), "--rate", str(RATE), "--size", "31", "--out", str(tmp_path / "results")]
+    with pytest.raises(SystemExit):
+        main(["measure", str(folder / "film.tif"), str(folder / "film.tif"), "--z", "-30", "30", *asked])
+    assert main(["measure", str(folder / "scan"), str(folder / "film.tif"), "--method", "correlation", *asked]) == 0
+    assert str(tmp_path / "results" / "field.vtr") in capsys.readouterr().out
+
+
+def test_depths_that_are_missing_are_asked_for_by_their_name(folder):
+    with pytest.raises(ValueError, match=r"^z_um: got none"):
+        measure(folder / "film.tif", folder / "film.tif", um_per_px=UM_PER_PX)
+
+
+@pytest.mark.parametrize(
+    ("paths", "name"),
+    [({"frames_path": "film.tif"}, "scan_path"), ({"frames_path": "film.tif", "scan_path": "scan"}, "um_per_px")],
+)
+def test_notebook_13_takes_nothing_of_the_example_for_yours(folder, tmp_path, paths, name):
+    """A film without a scan, and files that do not note the size of a pixel."""
+    tifffile.imwrite(tmp_path / "film.tif", tifffile.imread(folder / "film.tif"), photometric="minisblack")
+    (tmp_path / "scan").symlink_to(folder / "scan")
+    cells = json.loads((ROOT / "notebooks" / "13-your-own-images.ipynb").read_text(encoding="utf-8"))["cells"]
+    knobs, opens = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"][:2]
+    names = {}
+    exec(knobs, names)
+    names |= {key: str(tmp_path / value) for key, value in paths.items()}
+    with pytest.raises(ValueError, match=f"^{name}"):
+        exec(opens, names)
 
 
 def test_what_is_in_the_folder(folder, measured):

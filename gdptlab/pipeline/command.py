@@ -20,7 +20,8 @@ def add_to(commands: argparse._SubParsersAction) -> None:
         "measure",
         help="measure your own images",
         description="Calibrate on a scan of beads, measure a film, and write tables and a page that shows whether to "
-        f"trust them. A run that was stopped goes on where it was. Exit status: 0; {BAD} if the calibration is bad.",
+        "trust them; with --rate also tracks, velocities and a mean velocity field, for ParaView tracks.pvd and "
+        f"field.vtr. A run that was stopped goes on where it was. Exit status: 0; {BAD} if the calibration is bad.",
     )
     measures.set_defaults(do=measure_images)
     measures.add_argument("scan", help="TIFF, or folder of TIFFs: beads on a slide, one image for each depth")
@@ -159,4 +160,7 @@ def _say(folder: Path, quality: pd.DataFrame) -> int:
     for question, row in quality.iterrows():
         print(f"{row['verdict']:5s} {question}: {row['finding']}. {row['advice']}".rstrip())
     print(f"results: {folder}\npage:    {folder / 'report.html'}")
+    for_paraview = [str(folder / name) for name in ("field.vtr", "tracks.pvd") if (folder / name).exists()]
+    if for_paraview:
+        print("ParaView:", ", ".join(for_paraview))
     return BAD if (quality["verdict"] == "bad").any() else 0

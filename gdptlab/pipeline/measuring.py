@@ -265,7 +265,13 @@ def _unpacked(arrays: dict[str, NDArray]) -> ScanReport:
 def _opened_scan(scan: str | os.PathLike[str], z_um: tuple[float, float] | None) -> tuple[Images, NDArray[np.float64]]:
     """Images of a scan (N, rows, columns) and their depths (N,), by increasing depth."""
     if z_um is None:
-        return open_scan(scan)
+        open_images(scan)  # what is wrong with the files is not wrong with their names
+        try:
+            return open_scan(scan)
+        except ValueError as error:
+            raise ValueError(
+                f"z_um: got none, needed are the depths of the first and the last image of the scan, µm: {error}"
+            ) from error
     if not isinstance(z_um, Sequence | np.ndarray) or np.shape(z_um) != (2,):
         raise TypeError(f"z_um: got {z_um!r}, allowed are two numbers: the first and the last depth")
     z_um = tuple(number("z_um", float(z) if isinstance(z, np.generic) else z) for z in z_um)
@@ -310,12 +316,15 @@ def _hashes(images: Images) -> dict[str, str]:
 
 
 def _claim(folder: Path, call: dict[str, object]) -> None:
-    """Note in the folder what it is for, or refuse it if it is for something else."""
+    """Note in the folder what it is for, or refuse it if it holds something else.
+
+    Of a call that ended before it had results there is only the note, which does not hold.
+    """
     note = folder / "call.json"
-    if not note.exists():
-        others = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-        if others:
-            raise ValueError(f"folder: got {str(folder)!r}, which holds {others[0]!r}, allowed is an empty folder")
+    others = sorted(path.name for path in folder.iterdir() if not path.name.startswith(".") and path != note)
+    if others and not note.exists():
+        raise ValueError(f"folder: got {str(folder)!r}, which holds {others[0]!r}, allowed is an empty folder")
+    if not others:
         with written_whole(note) as temporary:
             temporary.write_text(json.dumps(call, indent=1), encoding="utf-8")
     try:
