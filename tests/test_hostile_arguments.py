@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 import tifffile
 from conftest import THOROUGH
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from test_hostile_input import CALIBRATION, ODD, STACK, Z_UM, arrays, disc
 
@@ -444,6 +444,7 @@ def test_works_or_names_an_argument(name, folder, monkeypatch):
     def attempt(data):
         chosen = data.draw(st.sets(st.sampled_from([*one.good]), min_size=1, max_size=2))
         given = one.good | {argument: data.draw(spoilt(one.good[argument]), argument) for argument in sorted(chosen)}
+        assume(not (name == "live.Monitor" and callable(given["source"])))  # a source without end
         try:
             one.function(**given)
         except (TypeError, ValueError, FileNotFoundError) as error:

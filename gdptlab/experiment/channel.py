@@ -401,6 +401,8 @@ class Trajectories:
             )
         if not density * (view + 2 * border + drift) < MOST_PARTICLES:
             raise ValueError(f"mean_in_view: got {mean_in_view!r}, allowed are {MOST_PARTICLES:g} particles in all")
+        if not drift < MOST_PARTICLES * view:
+            raise ValueError(f"view_length_um: got {view:g}, allowed is {drift / MOST_PARTICLES:g} or more")
         # Stretches from the downstream end: the view with its borders, then as many views as the drift needs.
         ends = view + 2 * border + view * np.arange(1 + np.ceil(drift / view))
         starts, counts = np.concatenate([[0.0], ends[:-1]]), np.diff(np.rint(density * ends), prepend=0).astype(int)

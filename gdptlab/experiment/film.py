@@ -79,13 +79,15 @@ class Film:
         if not np.isclose(scope.diameter_um, 2 * radius_um):
             raise ValueError(f"microscope: got diameter_um = {scope.diameter_um:g}, allowed is 2 x {radius_um:g}")
         if channel.height_um > scope.depth_um:
-            raise ValueError(f"height_um: got {channel.height_um:g}, allowed is to depth_um = {scope.depth_um:g}")
+            needed = f"at least the channel's height_um = {channel.height_um:g}"
+            raise ValueError(f"microscope: got depth_um = {scope.depth_um:g}, needed is {needed}")
         if channel.width_um > rows * scope.um_per_px:
-            view = f"{rows * scope.um_per_px:g} µm, what {rows} rows show"
-            raise ValueError(f"width_um: got {channel.width_um:g}, allowed is to {view}")
+            view = f"{rows} rows, which show {rows * scope.um_per_px:g} µm"
+            raise ValueError(f"shape: got {view}, needed is at least the channel's width_um = {channel.width_um:g}")
         if not np.isclose(self.trajectories.view_length_um, columns * scope.um_per_px):
-            view = f"{columns * scope.um_per_px:g} µm, what {columns} columns show"
-            raise ValueError(f"view_length_um: got {self.trajectories.view_length_um:g}, allowed is {view}")
+            view = f"{columns} columns, which show {columns * scope.um_per_px:g} µm"
+            needed = f"view_length_um = {self.trajectories.view_length_um:g} of the trajectories"
+            raise ValueError(f"shape: got {view}, needed is {needed}")
 
     @classmethod
     def seeded(

@@ -71,7 +71,7 @@ def brightfield(light: NDArray, white: float = WHITE) -> NDArray:
     array (rows, columns)
     """
     real_array("light", light, 2)
-    return number("white", white) - np.asarray(light)
+    return float(numbers("white", number("white", white))) - np.asarray(light)
 
 
 def disturbed(
@@ -109,7 +109,7 @@ def disturbed(
     along_x = np.sin(2 * np.pi * np.arange(columns) / positive("period_px[0]", period_px[0]) + phases[0])
     along_y = np.sin(2 * np.pi * np.arange(rows) / positive("period_px[1]", period_px[1]) + phases[1])
     wave = np.outer(along_y, along_x).astype(np.result_type(light, np.float32))
-    return brightfield(light, white) + number("amplitude", amplitude) * wave
+    return brightfield(light, white) + float(numbers("amplitude", number("amplitude", amplitude))) * wave
 
 
 IMAGE_TYPES: dict[str, Callable[[NDArray], NDArray]] = {

@@ -59,8 +59,8 @@ class Background:
         products = np.pad(self._pairs[0].T @ weight @ self._pairs[1], (0, 1))
         down, across = self._where
         matrix = products[down[:, None, :, None], across[None, :, None, :]].reshape(m * n, m * n).astype(np.float64)
-        # Where the frame says nothing the surface stays small (in `fit`, near the median).
-        matrix[np.diag_indices(m * n)] += 1e-6 * np.trace(matrix) / (m * n)
+        # Where the frame says nothing the surface stays small (in `fit`, near the median), also if that is everywhere.
+        matrix[np.diag_indices(m * n)] += 1e-6 * np.trace(matrix) / (m * n) or 1.0
         return matrix
 
     def surface(self, coefficients: NDArray) -> NDArray[np.float32]:
@@ -123,10 +123,12 @@ def suitable(
     Compared is the median size of what is left (rows, columns), smoothed over `smooth_px`: noise is little there, and
     particles that are not found yet are on few pixels.
     """
-    left = []
+    left, seen = [], weight > 0
+    if not seen.any():
+        return 0
     for surface in surfaces:
         smooth = cv2.GaussianBlur(residual - surface.fit(residual, weight), (0, 0), smooth_px)
-        left.append(np.median(np.abs(smooth[weight > 0])))
+        left.append(np.median(np.abs(smooth[seen])))
     return int(np.argmax(np.array(left) <= finer * left[-1]))
 
 

@@ -5,6 +5,7 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import methodcaller
 from pathlib import Path
 
 import numpy as np
@@ -226,7 +227,7 @@ def _calibrated(
 ) -> Calibration:
     """Calibration from a scan (N, rows, columns), made once for files of these hashes and then kept in the cache."""
     note = {} if prepare is None or prepare.camera is None else prepare.camera.note()
-    said = json.dumps([sorted(hashes), z_um.tolist(), choices, note], sort_keys=True, default=np.ndarray.tolist)
+    said = json.dumps([sorted(hashes), z_um.tolist(), choices, note], sort_keys=True, default=methodcaller("tolist"))
     folder = sources_folder("calibrations")
     kept = folder and folder / f"{hashlib.sha256(said.encode()).hexdigest()[:32]}.npz"
     arrays = kept_arrays(kept) if kept else None

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gdptlab._checks import LARGEST, positive, table
+from gdptlab._checks import LARGEST, numbers, positive, table
 from gdptlab.calibration import Calibration, checked
 from gdptlab.denoising import noise_level, signal_to_noise
 from gdptlab.fit.bounds import expected_error
@@ -152,7 +152,8 @@ def report(calibration: Calibration, mismatch: pd.DataFrame | None = None) -> pd
             _drift(made.drift_px, calibration.size),
         ]
     if mismatch is not None:
-        table("mismatch", mismatch, ("n", "mismatch", "own"))
+        for name in table("mismatch", mismatch, columns := ["n", "mismatch", "own"])[columns]:
+            numbers("mismatch", mismatch[name].dropna())
         judgements.append(_mismatch(mismatch, span))
     verdicts = ["bad" if each.bad else "look" if each.look else "good" for each in judgements]
     advice = ["" if v == "good" else each.advice for each, v in zip(judgements, verdicts, strict=True)]

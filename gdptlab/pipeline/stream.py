@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
+from gdptlab._checks import flag, real_array
 from gdptlab._checks import path as check_path
-from gdptlab._checks import real_array
 from gdptlab._files import written_whole
 from gdptlab.calibration import Calibration
 from gdptlab.locate import BLOCK, blank_table, in_blocks, prepared
@@ -75,13 +75,14 @@ def batch_to_parquet(
         As `batch` and `open_images`; also if the folder holds a table made with other frames, settings, calibration
         or software (the message says what differs), or other files.
     """
+    shown = flag("progress", progress)
     frames = open_images(frames) if isinstance(frames, str | os.PathLike) else frames
     columns = list(blank_table(calibration, n_jobs, settings))
     frames, prepare = prepared(frames, calibration, prepare)
     done_before = {} if prepare is None else {"prepared": prepare.note()}
     folder = _claimed(folder, about(calibration, settings) | _film(frames) | done_before)
     done = _whole_parts(folder)
-    with tqdm(total=len(frames), initial=sum(done.values()), desc="frames", unit="frame", disable=not progress) as bar:
+    with tqdm(total=len(frames), initial=sum(done.values()), desc="frames", unit="frame", disable=not shown) as bar:
         for first, n, table in in_blocks(frames, calibration, n_jobs, settings, done):
             part = _part(folder, first, n)
             table = table if prepare is None else prepare.restored(table)

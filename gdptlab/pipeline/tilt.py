@@ -18,8 +18,9 @@ from gdptlab.pipeline.image_curve import features
 from gdptlab.pipeline.labels import LEAST, calibration_of_labels, check_sizes
 from gdptlab.pipeline.lone_images import lone_images
 
-STEEPEST_DEG = 60.0
-"""Largest tilt, degrees. Convention: steeper slides do not stay in the depth of any lens."""
+FLATTEST_DEG, STEEPEST_DEG = 0.01, 60.0
+"""Least and largest tilt, degrees. Convention: a field of 1 mm rises by 0.2 µm, less than what is measured; steeper
+slides do not stay in the depth of any lens."""
 
 TRIED = 200
 """Number of offsets of a frame, each to either side, that are tried. Derived: steps of half a percent of the depth."""
@@ -44,8 +45,8 @@ def calibration_of_tilt(
     """Calibrate with beads on a tilted slide; see `Calibration.from_tilt`."""
     frames = real_array("frames", frames, 3)
     choice("axis", axis, ("x", "y"))
-    if not 0 < abs(number("tilt_deg", tilt_deg)) <= STEEPEST_DEG:
-        raise ValueError(f"tilt_deg: got {tilt_deg:g}, allowed is 0 to {STEEPEST_DEG:g} either way, but not 0")
+    if not FLATTEST_DEG <= abs(number("tilt_deg", tilt_deg)) <= STEEPEST_DEG:
+        raise ValueError(f"tilt_deg: got {tilt_deg:g}, allowed is {FLATTEST_DEG:g} to {STEEPEST_DEG:g} either way")
     check_sizes(size, n_sub, frames.shape[1:])
     if not 1e-4 <= positive("um_per_px", um_per_px) <= 1e4:
         raise ValueError(f"um_per_px: got {um_per_px:g}, allowed is 1e-4 to 1e4")

@@ -27,6 +27,9 @@ from gdptlab.pipeline.lone_images import LoneImages, lone_images
 LEAST_PARTICLES = 100
 """Least number of particles that stand alone: two or three for each slice."""
 
+HIGHEST_UM = 1e5
+"""Largest height of a channel, µm. Convention: no microscope looks 10 cm deep."""
+
 OUTER = 5
 """Slices at either end whose images tell the wide end."""
 
@@ -101,7 +104,9 @@ def calibrated(
     fitted: int = FITTED,
 ) -> Calibration:
     """Calibrate with a film; see `Calibration.from_film`."""
-    room = positive("height_um", height_um) / 2 - positive("radius_um", radius_um, zero=True)
+    if not positive("height_um", height_um) <= HIGHEST_UM:
+        raise ValueError(f"height_um: got {height_um:g}, allowed is to {HIGHEST_UM:g}")
+    room = height_um / 2 - positive("radius_um", radius_um, zero=True)
     if room <= 0:
         raise ValueError(f"radius_um: got {radius_um:g}, allowed is below half of height_um = {height_um:g}")
     if speed is not None:

@@ -244,7 +244,7 @@ def imitate(
     tree = KDTree(start)
     for other in instances("others", others, Film):
         there, borrowers = _paths(other)
-        near = tree.query(borrowers, k=3)[1]
+        near = tree.query(borrowers, k=[*range(1, min(3, len(start)) + 1)])[1]
         chosen = start.index.to_numpy()[rng.permuted(near, axis=1)[:, 0]]
         there["lender"] = there["particle"].map(dict(zip(borrowers.index, chosen, strict=True)))
         made = there.merge(lent, on=["frame", "lender"], suffixes=("", "_off"))

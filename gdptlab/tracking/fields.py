@@ -1,5 +1,6 @@
 """What many tracks say together: mean values on a grid, profiles, mean squared displacements."""
 
+import warnings
 from collections.abc import Iterable, Mapping
 from numbers import Integral
 
@@ -144,7 +145,9 @@ def mean_squared_displacement(tracks: pd.DataFrame, frame_rate_hz: float, *, lon
     if not tracks.duplicated("particle").any():
         raise ValueError("tracks: got none of two or more rows, needed is one")
     floats, most = tracks.astype(dict.fromkeys(columns, float)), whole("longest", longest, 1, 10**6)
-    found = trackpy.emsd(floats, 1.0, rate, max_lagtime=most, detail=True, pos_columns=columns)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of how trackpy calls pandas
+        found = trackpy.emsd(floats, 1.0, rate, max_lagtime=most, detail=True, pos_columns=columns)
     made = {"lag_s": found["lagt"]} | {
         f"msd_{column[0]}_{column.rpartition('_')[2]}2": found[f"<{column}^2>"] for column in columns
     }
