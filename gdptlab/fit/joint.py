@@ -8,7 +8,7 @@ residual is more than noise, particles are taken out and sought once more, or tw
 film the particles of one frame, moved on, are where the next begins.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gdptlab.fit.background import Background, suitable
+from gdptlab.fit.debris import covered_pixels
 from gdptlab.fit.depths import Alone, Trials
 from gdptlab.fit.judgement import LEAST_GAIN, Level, learned_population
 from gdptlab.fit.model import PatternModel, field_terms
@@ -92,6 +93,13 @@ LEAST_SIGMA = 0.06
 LOST = 0.2
 """Fraction of a frame's particles that may be gone in the next (or two of them); if more are, all are sought anew."""
 
+COVERS = 3
+"""Largest number of times that pixels are left out because debris covers them. Chosen: after the first the rim of what
+was taken for a particle shows, the second hardly finds more."""
+
+SEEN = 0.5
+"""Least fraction of a particle's image that is seen beside debris. Convention."""
+
 UNKNOWN = Population(1.0, 2.0)
 """Distribution of the amplitudes where nothing was found."""
 
@@ -117,6 +125,10 @@ class Explained:
     pixels : Pixels
     gain, excess : float64 arrays
         Log-likelihood that each particle of the fit adds; its chi-square over that of noise and patterns' errors.
+    covered : bool array (rows, columns)
+        Pixels that are left out, as debris covers them.
+    debris : DataFrame, optional
+        Rows that no pattern explained before these pixels were left out.
     """
 
     fit: Fit
@@ -129,6 +141,8 @@ class Explained:
     pixels: Pixels
     gain: NDArray[np.float64]
     excess: NDArray[np.float64]
+    covered: NDArray[np.bool_]
+    debris: pd.DataFrame | None = None
 
 
 class Joint:
@@ -174,10 +188,40 @@ class Joint:
     def first(self, frame: NDArray[np.float32]) -> Explained:
         """Explain a frame (rows, columns) of which nothing is known."""
         pixels = usable_pixels(frame)
-        frame = self._normalised(pixels)
-        places, population, surface = self._search(frame, pixels)
-        variance, background, tried = Variance(), None, False
-        weight = variance.weight(np.zeros_like(frame), pixels.valid)
+        found = self._settled(pixels, *self._search(self._normalised(pixels), pixels))
+        debris = []
+        for _ in range(COVERS):
+            covered, before = self._covered(found), found
+            if (covered <= found.covered).all():
+                break
+            foreign = self._foreign(found)
+            debris.append(self.table(replace(found, stays=found.stays & foreign, debris=None), foreign=True))
+            places = found.fit.places[found.stays & ~foreign & ~_at(covered, found.fit.places)]
+            covered |= found.covered
+            left = replace(pixels, valid=pixels.valid & ~covered)
+            found = self._settled(left, places, before.population, before.surface, before)
+            seen = found.fit.chi2_of(np.ones_like(frame), left.valid.astype(np.float32))
+            stays = found.stays & (seen > SEEN)
+            found = replace(found, stays=stays, covered=covered, debris=pd.concat(debris, ignore_index=True))
+        return found
+
+    def _settled(
+        self,
+        pixels: Pixels,
+        places: NDArray[np.float64],
+        population: Population,
+        surface: int,
+        before: Explained | None = None,
+    ) -> Explained:
+        """Explain a frame from the places of particles that were found, more of which are sought where all is fitted.
+
+        Variance and background begin as they were `before`.
+        """
+        frame, tried = self._normalised(pixels), False
+        variance, background, image = Variance(), None, np.zeros_like(frame)
+        if before is not None:
+            variance, background, image = before.variance, before.fit.background, before.fit.image
+        weight = variance.weight(image, pixels.valid)
         for again in range(REFITS):
             fit = self._fitted(frame, places, weight, population, surface, background, STEPS)
             total = self._full.error_variance(fit.places, self.shape)
@@ -201,7 +245,20 @@ class Joint:
             kept = stays & ~two
             places = np.concatenate([self._full.merged(likelier[kept], excess[kept]), pairs, new])
         velocity = np.zeros((len(fit.places), 3))
-        return Explained(fit, stays, fit.places, velocity, population, surface, variance, pixels, gain, excess)
+        return Explained(
+            fit, stays, fit.places, velocity, population, surface, variance, pixels, gain, excess,
+            np.zeros(self.shape, bool),
+        )  # fmt: skip
+
+    def _covered(self, found: Explained) -> NDArray[np.bool_]:
+        """Pixels (rows, columns) that debris covers."""
+        fit, foreign = found.fit, found.stays & self._foreign(found)
+        if not foreign.any() and not found.covered.any():
+            return found.covered
+        weight = found.variance.weight(fit.image, found.pixels.valid | found.covered)
+        total = self._full.error_variance(fit.places, self.shape)
+        residual = fit.residual * np.sqrt(weight / (1 + weight * total))
+        return covered_pixels(residual, fit.places[foreign], found.covered, self.model.size)
 
     def _suits(self, light: NDArray[np.float32], weight: NDArray[np.float32]) -> int:
         """Which of the backgrounds suits a frame from which its particles were taken."""
@@ -210,6 +267,7 @@ class Joint:
     def following(self, frame: NDArray[np.float32], before: Explained) -> Explained:
         """Explain the frame after one that is explained. A particle that appears in it is in the table of the next."""
         pixels = usable_pixels(frame, before.pixels.noise)
+        pixels = replace(pixels, valid=pixels.valid & ~before.covered)
         frame = self._normalised(pixels)
         places = before.places.copy()
         places[:, :3] += before.velocity
@@ -224,7 +282,7 @@ class Joint:
         moved = (before.velocity + fit.places[:, :3] - before.places[:, :3])[stays] / 2
         population = learned_population(fit, stays, before.population)
         new = self._unexplained(fit, weight, total, population)
-        return Explained(
+        found = Explained(
             fit,
             stays,
             np.concatenate([fit.places[stays], new]),
@@ -235,7 +293,9 @@ class Joint:
             pixels,
             gain,
             self._full.excess(fit, weight, total),
+            before.covered,
         )
+        return replace(found, covered=self._covered(found))
 
     @property
     def _open(self) -> bool:
@@ -349,8 +409,8 @@ class Joint:
             around it, over the variance; `chi2_without`, the same were the particle removed; `z_other_um`, the best
             depth on the other side of focus, NaN where there is none; `log_ratio`, the logarithm of the likelihood of
             the first depth over that of the second, infinity where there is none; `ambiguous`, whether that is below
-            `AMBIGUOUS`. `attrs` counts the pixels left out, `saturated_px` and `defective_px`, and the rows kept out,
-            `foreign`.
+            `AMBIGUOUS`. `attrs` counts the pixels left out, `saturated_px`, `defective_px`, `covered_px` (by debris),
+            and the rows kept out, `foreign`.
         """
         fit, model = explained.fit, self.model
         y, x, slices, amplitude = fit.places[:, :4].T
@@ -396,7 +456,12 @@ class Joint:
         inside = kept & (y >= -0.5) & (y < rows - 0.5) & (x >= -0.5) & (x < columns - 0.5)
         table = table[inside].sort_values("cm", ascending=False, ignore_index=True)
         table.attrs |= {"saturated_px": explained.pixels.saturated, "defective_px": explained.pixels.defective}
+        table.attrs["covered_px"] = int(explained.covered.sum())
         table.attrs["foreign"] = int((explained.stays & self._foreign(explained)).sum())
+        if explained.debris is not None:
+            table.attrs["foreign"] += len(explained.debris)
+            if foreign:
+                table = pd.concat([table, explained.debris], ignore_index=True)
         return table
 
 
@@ -466,6 +531,12 @@ class _Search:
         self._stays = self._stays.copy()
         self._stays[np.flatnonzero(self._stays)[which]] = False
         self._image = self._typical_image()
+
+
+def _at(mask: NDArray[np.bool_], places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """What a mask (rows, columns) says of the pixels of places (P, 2 or more): y, x."""
+    y, x = np.clip(np.rint(places[:, :2]).astype(int), 0, np.array(mask.shape) - 1).T
+    return mask[y, x]
 
 
 def _even(patterns: NDArray) -> int:
