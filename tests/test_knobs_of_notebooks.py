@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import nbformat
 import pytest
 from conftest import THOROUGH
+from IPython.display import display
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
@@ -46,6 +47,8 @@ SMALL = {
     "10": {"n_beads": 4, "n_frames": 2, "crowds": (25,), "noises": (38.0,), "n_crowded": 2},
     "11": {"duration_s": 3.0, "factors": (1,), "n_films": 3, "n_measured": 1, "measured_s": 2.0, "n_jobs": 1},
     "12": {"live_s": 1.0, "n_again": 2, "n_loops": 8},
+    "13": {"size": 61, "film_s": 0.4},
+    "14": {"n_frames": 60, "checked": 1, "every": 57, "n_tests": 1, "labelled": (3, 40), "n_beads": 25},
 }
 """Settings of size, by the number of the notebook."""
 
@@ -82,12 +85,14 @@ CHANGED = [
     ("11", {"E_ac": 2.4, "mean_in_view": 30.0, "crowd_in_view": 60.0}),
     ("12", {"live_in_view": 25.0, "n_sub": 6, "level": 0.85, "tau_s": 0.12}),
     ("13", {"threshold": 0.6, "method": "correlation", "frame_number": 0}),
+    ("14", {"image_type": "brightfield", "unequal": 0.2, "mean_in_view": 40.0}),
 ]
 
 
 def execute(path: Path, changed: dict[str, object]) -> None:
     """Execute the code cells of a notebook, with other values right after its parameters cell."""
     module = ModuleType("changed_notebook")
+    module.__dict__["display"] = display  # a kernel has it without an import
     sys.modules[module.__name__] = module
     try:
         for number, cell in enumerate(nbformat.read(path, as_version=4).cells):
