@@ -52,8 +52,8 @@ SMALL = {
 }
 """Settings of size, by the number of the notebook."""
 
-LONG = {"09", "12", "14"}
-"""Numbers of the notebooks that take 20 s of processor time or more at the settings `SMALL`."""
+LONG = {"09", "14"}
+"""Numbers of the notebooks that take more than 15 s of processor time with the settings `SMALL`: at least 40 s each."""
 
 CHANGED = [
     ("00", {"threshold": 0.7, "n_sub": 5}),
