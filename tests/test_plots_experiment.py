@@ -105,7 +105,7 @@ def test_three_answers_draw_what_they_are_given(points: pd.DataFrame) -> None:
     seen = pd.DataFrame(np.linspace(0, 1, 10).reshape(2, 5), columns=columns, index=[0.0, 1.0])
     figure = plots.three_answers(slower, change, seen, 0.9, {"here": 1.0}, ("none", "little", "there"))
     shown = texts(figure)
-    assert all(word in shown for word in ("What does refinement buy?\nlittle", "here ", "valid, of the true"))
+    assert all(word in shown for word in ("What does refinement buy?\nlittle", "here ", "valid / true"))
     right = figure.axes[0].get_lines()[0].get_ydata()
     assert list(right) == list(100 - 100 * slower[slower["trigger"] == "h"].sort_values("tau_s")["failed"])
 

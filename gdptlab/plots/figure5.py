@@ -140,7 +140,7 @@ def fig5_settings(points: pd.DataFrame, labels: Mapping[tuple, str], counts: Map
         Line2D([], [], color=COLOURS[1], marker="s", mfc="white", label="not refined"),
     ]
     names = [*(handle.get_label() for handle in handles), *words]
-    figure.legend([*handles, *lines], names, loc="outside lower right", ncols=len(names), fontsize="small")
+    figure.legend([*handles, *lines], names, loc="outside lower right", ncols=3, fontsize="small")
     return figure
 
 
@@ -252,7 +252,7 @@ def three_answers(
     second.axvline(0, color="black", lw=0.8)
     second.invert_yaxis()
     second.grid(axis="x", color="0.93")
-    second.set(xlabel="more failed films without it (points)")
+    second.set(xlabel="more films fail without it (percentage points)")
     third.axhline(100 * level, color="black", lw=0.8, ls=":")
     third.set(xlabel="t (s)", ylabel="particles (%)", ylim=(0, 104))
     questions = ("What does evaluation time buy?", "What does refinement buy?", "Where does it fail?")
@@ -261,7 +261,7 @@ def three_answers(
     handles = [
         *(Line2D([], [], color=TRIGGER_COLOURS[a], lw=2, label=f"measured in {a}/3") for a in TRIGGERS),
         Line2D([], [], color="0.3", lw=1, ls="--", label="true"),
-        Line2D([], [], color="0.5", lw=2, label="valid, of the true"),
+        Line2D([], [], color="0.5", lw=2, label="valid / true"),
     ]
     figure.legend(handles=handles, loc="outside lower right", ncols=4, fontsize="small")
     return figure
