@@ -5,7 +5,8 @@ together. While much is unexplained, frame and patterns are high-pass filtered: 
 there, and do not pull. What is too bright for one particle may be two: what its amplitude has above the population's
 stays in the residual that is searched. A particle stays while it adds to the likelihood beside the others; where the
 residual is more than noise, particles are taken out and sought once more, two that are too near are made one, or one
-is made two (`pairs`). Pixels that debris covers are left out, and all is fitted again (`debris`). In a film the particles of one frame, moved on, are where the next begins.
+is made two (`pairs`). Pixels that debris covers are left out, and all is fitted again (`debris`). In a film the
+particles of one frame, moved on, are where the next begins.
 """
 
 from dataclasses import dataclass, replace
