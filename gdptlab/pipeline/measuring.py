@@ -275,7 +275,7 @@ def _opened_scan(scan: str | os.PathLike[str], z_um: tuple[float, float] | None)
             ) from error
     if not isinstance(z_um, Sequence | np.ndarray) or np.shape(z_um) != (2,):
         raise TypeError(f"z_um: got {z_um!r}, allowed are two numbers: the first and the last depth")
-    z_um = tuple(number("z_um", float(z) if isinstance(z, np.generic) else z) for z in z_um)
+    z_um = tuple(number("z_um", z.item() if isinstance(z, np.generic) else z) for z in z_um)
     images = open_images(scan)
     if len(images) < 2 or z_um[0] == z_um[1]:
         raise ValueError(f"z_um: got {z_um!r} for {len(images)} images, allowed are two depths for two or more")
