@@ -14,7 +14,7 @@ from gdptlab.fit.solver import FAINTEST, LONGEST_STEP, Fit
 
 NOTED = 3.0
 """Standard deviations by which a particle's chi-square is above 1 if it is tried as two. Chosen on frames of lognormal
-amplitudes between 2 and 7: with 5 one in six pairs is missed, with 2 no more are found."""
+amplitudes: where their spread is 0.6, recall is 0.994 with 5, 0.996 with 3 and with 2."""
 
 CLEARLY = 60.0
 """Log-likelihood by which two particles must explain more than one. Chosen on the same frames between 20 and 80: with
@@ -26,8 +26,8 @@ are not known: two must then explain more by this factor than what so many reach
 10 %, one pattern known, a tenth of all particles would else be split, nearly all of them wrongly."""
 
 APART = 0.1
-"""Depth to either side at which two particles begin, as a fraction of the stack. Between 0.06 and 0.16 the same pairs
-are found."""
+"""Depth to either side at which two particles begin, as a fraction of the stack. Between 0.06 and 0.16 the pairs that
+are found hardly differ."""
 
 STEPS = 6
 """Steps of the fit of two (Levenberg-Marquardt). With 10 nearly the same pairs are found."""
@@ -58,7 +58,8 @@ def split(
     which, is_two = np.flatnonzero(noted), np.zeros(len(noted), bool)
     if not len(which):
         return is_two, fit.places[:0]
-    fits = [_Two(level, fit, i, weight / (1 + weight * total)) for i in which]
+    certain = weight / (1 + weight * total)
+    fits = [_Two(level, fit, i, certain) for i in which]
     for _ in range(STEPS + 1):
         columns = level.renderer.draw(np.concatenate([two.trial for two in fits]), fit.frame.shape)
         for k, two in enumerate(fits):
