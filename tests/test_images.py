@@ -488,6 +488,18 @@ def test_depths_that_are_refused(tmp_path, monkeypatch, files, arguments, messag
         open_scan(tmp_path, **arguments)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with a name are of POSIX")
+def test_depths_are_read_from_a_file_alone(tmp_path):
+    """A number would be the descriptor of an open file, a pipe would be waited for."""
+    for k in range(2):
+        write(tmp_path / f"{k}.tif", FILM[0])
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(TypeError, match=r"^csv: "):
+        open_scan(tmp_path, csv=0)
+    with pytest.raises(ValueError, match=r"^csv: .*'pipe.csv'"):
+        open_scan(tmp_path, csv=tmp_path / "pipe.csv")
+
+
 # -------------------- measured
 
 

@@ -326,6 +326,9 @@ def open_scan(
 
 def _depths_of_table(path: str | os.PathLike[str], n: int) -> NDArray[np.float64]:
     """Column z_um of a CSV file, if it has a number for each of `n` images: (n,)."""
+    path = check_path("csv", path)
+    if path.exists() and not path.is_file():  # reading a pipe would wait for ever
+        raise ValueError(f"csv: got {path.name!r}, allowed is a file")
     try:
         with open(path, encoding="utf-8-sig") as file:
             european = ";" in file.readline()
@@ -333,7 +336,7 @@ def _depths_of_table(path: str | os.PathLike[str], n: int) -> NDArray[np.float64
     except FileNotFoundError as error:
         raise FileNotFoundError(f"csv: got {str(path)!r}, where there is no file") from error
     except Exception as error:  # of many kinds
-        raise ValueError(f"csv: got {path!r}, which cannot be read: {error}") from error
+        raise ValueError(f"csv: got {str(path)!r}, which cannot be read: {error}") from error
     if not isinstance(table.index, pd.RangeIndex):
         raise ValueError("csv: got more columns than names of columns, allowed are points as in 1.5, not commas")
     if "z_um" not in table or len(table) != n:
