@@ -81,6 +81,17 @@ def test_a_particle_beside_debris_is_measured(speckled, microscope):
     assert later.covered.any() and len(match(plan.table(later), true)) >= len(true) - 1
 
 
+def test_a_speck_that_leaves_is_covered_no_more(speckled, microscope):
+    calibration, true, rng = speckled
+    frame = microscope.render(true, (400, 400), rng=rng).astype(np.float32)
+    spoilt = frame.copy()
+    spoilt[113:133, 223:243] += 2500
+    plan = Joint(calibration.model, frame.shape)
+    found = plan.first(spoilt)
+    assert found.covered.any()
+    assert not plan.following(frame, plan.following(frame, found)).covered.any()
+
+
 def test_a_frame_without_debris_is_not_covered(speckled, microscope):
     calibration, true, rng = speckled
     plan = Joint(calibration.model, (400, 400))

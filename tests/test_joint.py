@@ -477,3 +477,29 @@ def test_a_plane_decides_between_two_depths():
     assert decided["z_other_um"].tolist()[2] == -8.0 and decided["log_ratio"].tolist()[2] == -2.0
     with pytest.raises(ValueError, match="log_ratio"):
         decided_by_plane(rows.drop(columns="log_ratio"))
+
+
+@pytest.fixture(scope="module")
+def lined_up(clean_stack):
+    """A plan, and a film of particles that have lined up, as sound does: six frames, and the particles of each."""
+    rng = np.random.default_rng(3)
+    plan = Joint(Calibration.from_stack(clean_stack + rng.normal(0, 38, clean_stack.shape), Z_UM).model, (256, 512))
+    x = np.sort(rng.uniform(10, 500, 70))
+    y, z = 128 + rng.normal(0, 0.5, len(x)), rng.normal(0, 1.5, len(x))
+    true = [pd.DataFrame({"x_px": x + 0.3 * k, "y_px": y, "z_um": z}) for k in range(6)]
+    return plan, [Microscope().render(t, (256, 512), rng=rng).astype(np.float32) for t in true], true
+
+
+def test_particles_that_line_up_are_found_in_a_frame_alone(lined_up):
+    plan, frames, true = lined_up
+    table = plan.table(plan.first(frames[0]))
+    assert len(match(table, true[0])) >= 0.95 * len(true[0])
+    assert len(table) <= 1.02 * len(true[0]) and table.attrs["covered_px"] == 0
+
+
+def test_particles_that_line_up_are_not_covered_in_a_film(lined_up):
+    plan, frames, true = lined_up
+    found = plan.first(frames[0])
+    for frame, there in zip(frames[1:], true[1:], strict=True):
+        found = plan.following(frame, found)
+        assert not found.covered.any() and len(match(plan.table(found), there)) >= 0.9 * len(there)

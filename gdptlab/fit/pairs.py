@@ -41,7 +41,13 @@ ROOM_PX = 2
 
 
 def split(
-    level: Level, fit: Fit, stays: NDArray[np.bool_], weight: NDArray[np.float32], total: NDArray[np.float32]
+    level: Level,
+    fit: Fit,
+    stays: NDArray[np.bool_],
+    weight: NDArray[np.float32],
+    total: NDArray[np.float32],
+    *,
+    crowd: bool = False,
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Which particles (P,) are two, and the places (2 n, 4 + K) of those in their stead.
 
@@ -53,6 +59,8 @@ def split(
         Particles that are believed.
     weight, total : float32 arrays (rows, columns)
         One over the variance of each pixel, and the variance of the errors of all patterns.
+    crowd : bool
+        Whether many particles may be two: then `COMMON` does not hold.
     """
     noted = stays & (fit.chi2 - 1 > NOTED * np.sqrt(2 / fit.area)) & level.worst(fit.places, fit.chi2)
     which, is_two = np.flatnonzero(noted), np.zeros(len(noted), bool)
@@ -68,7 +76,7 @@ def split(
     gain = np.zeros(len(noted))
     gain[which] = np.array([two.gain for two in fits]) * level.retained(fit, weight, total)[which]
     common = np.sort(np.append(gain[stays], (0, 0)))[::-1][1 + int(COMMON * stays.sum())]
-    clear = gain[which] > max(CLEARLY, TWICE * common)
+    clear = gain[which] > max(CLEARLY, 0 if crowd else TWICE * common)
     is_two[which[clear]] = True
     return is_two, np.concatenate([fit.places[:0], *(fits[k].places for k in np.flatnonzero(clear))])
 
