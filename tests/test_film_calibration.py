@@ -87,6 +87,12 @@ def test_report_says_what_a_film_cannot_tell(made):
     assert table.loc["sides of focus", "verdict"] == "look"
 
 
+def test_two_kinds_of_particle_are_noticed():
+    frames, _ = film(7, kinds=(1.0, 1.6))
+    calibration = Calibration.from_film(frames, height_um=HEIGHT_UM, fitted=20)
+    assert report(calibration).loc["one kind", "verdict"] == "bad"
+
+
 def test_order_follows_depth_and_folds_where_both_sides_look_alike():
     for apart_um, folded in ((10.0, False), (0.0, True)):
         frames, truth = film(2, apart_um=apart_um, frames=90)
