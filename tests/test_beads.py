@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from scipy.spatial import KDTree
 
-from gdptlab import Calibration, assessment, locate
-from gdptlab.experiment import Camera, Microscope
+from gdptlab import Calibration, assessment, batch, locate
+from gdptlab.experiment import Camera, Microscope, WaveMicroscope
 from gdptlab.pipeline import depth_quality, find_beads, report
 
 Z_UM = np.linspace(-50, 50, 26)
@@ -211,6 +211,21 @@ def test_an_outlier_is_left_out(scan) -> None:
     assert beads["verdict"].value_counts()["used"] == 3
     odd = beads[beads["verdict"] == "an outlier"]
     assert len(odd) == 1 and np.hypot(odd["x_px"] - x, odd["y_px"] - y).item() < 5
+
+
+@pytest.mark.parametrize(("kind", "counts"), [("fluorescent", 400_000.0), ("brightfield", 160_000.0)])
+def test_every_other_slice_of_one_bead_with_rings_measures_the_rest(kind, counts) -> None:
+    """A bead that fills most of its frame: light or dark rings, to 0.25 % of the range of depths (RMS)."""
+    microscope, z_um = WaveMicroscope(na=0.6, spherical=0.5, counts=counts), np.linspace(-6, 6, 61)
+    rng, camera = np.random.default_rng(1), Camera(read_noise=20)
+    bead = pd.DataFrame({"x_px": [23.3], "y_px": [22.8]})
+    how = {"image_type": kind, "camera": camera, "rng": rng}
+    scan = np.stack([microscope.render(bead.assign(z_um=z), (48, 48), **how) for z in z_um])
+    made, odd = Calibration.from_scan(scan[::2], z_um[::2]), np.arange(1, 60, 2)
+    assert made.size >= 39 and scan.min() > 0 and scan.max() < 2**16 - 1
+    true = bead.merge(pd.DataFrame({"frame": range(len(odd)), "z_um": z_um[odd]}), how="cross")
+    pairs = assessment.match(batch(scan[odd], made, method="correlation", progress=False), true, within_um=2)
+    assert len(pairs) == len(odd) and np.sqrt((pairs["dz_um"] ** 2).mean()) < 0.0025 * 12
 
 
 def flowing(radius, speed, n=16):

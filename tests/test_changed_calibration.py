@@ -102,6 +102,14 @@ def test_sides_refused() -> None:
 # -------------------- cut-outs of even size
 
 
+def test_cut_outs_of_100_px_measure() -> None:
+    made = Calibration.from_stack(stack_of(100, 49.5), Z_UM)
+    assert made.size == 99
+    frame = blurred(7.0, 60.3, 58.8, (120, 120)) + np.random.default_rng(2).normal(0, 3, (120, 120))
+    (found,) = locate(frame, made, threshold=0.6, side="far").itertuples()
+    assert abs(found.z_um - 7) < 0.5 and np.hypot(found.x_px - 60.3, found.y_px - 58.8) < 0.8
+
+
 @pytest.mark.parametrize("middle", [16, 16.4, 17, 16.6])
 def test_even_cut_outs_are_made_odd(middle) -> None:
     made = Calibration.from_stack(stack_of(34, middle), Z_UM)

@@ -3,8 +3,9 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.ndimage import shift
 
-from gdptlab import Calibration, batch, match
+from gdptlab import Calibration, batch, datasets, locate, match
 from gdptlab.pipeline import with_errors
 
 Z_UM = np.arange(-30, 31, 2.0)
@@ -48,6 +49,52 @@ def test_errors_are_what_is_said(noise) -> None:
         ratio = pairs[error].to_numpy() / table.loc[pairs["measured"], stated].to_numpy()
         assert 0.8 < np.sqrt((ratio**2).mean()) < 1.25, error
         assert (np.abs(ratio) < 2).mean() > 0.9, error
+
+
+def of_one_bead(image, calibration, x_px, y_px, z_um):
+    """Error of z over its standard deviation, of the bead at a position; NaN if it is off by 5 µm or more."""
+    table = with_errors(locate(image, calibration, threshold=0.3), calibration)
+    table = table[np.hypot(table["x_px"] - x_px, table["y_px"] - y_px) < 4].nlargest(1, "cm")
+    error = table["z_um"] - z_um
+    return (error / table["z_std_um"])[error.abs() < 5].sum() if (error.abs() < 5).any() else np.nan
+
+
+def robust(ratios):
+    """Robust standard deviation of ratios (n,), and the fraction that are known."""
+    return 1.4826 * np.nanmedian(np.abs(ratios)), np.isfinite(ratios).mean()
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_errors_of_a_real_astigmatic_bead_are_what_is_said(noise) -> None:
+    """Odd slices of a bead, moved within a pixel, by the even ones; the noise is added."""
+    try:
+        stack = datasets.astigmatic_bead()
+    except FileNotFoundError as missing:
+        pytest.skip(str(missing))
+    rng, ratios = np.random.default_rng(3), []
+    even = stack[::2] + rng.normal(0, noise / 3, stack[::2].shape)
+    calibration = Calibration.from_stack(even, np.arange(0, len(stack), 2.0))
+    for k in np.tile(np.arange(5, 56, 2), 4):
+        off = rng.uniform(-0.5, 0.5, 2)
+        image = shift(np.pad(stack[k], 20), off, mode="nearest") + rng.normal(0, noise, (101, 101))
+        ratios.append(of_one_bead(image, calibration, 50 + off[1], 50 + off[0], k))
+    std, known = robust(ratios)
+    assert 0.75 < std < 1.25 and known > 0.98
+
+
+def test_errors_of_a_real_bead_beside_those_of_others() -> None:
+    """Odd slices by the even ones of the same bead: nearly what is said. With others' images beads differ by more."""
+    try:
+        beads = datasets.planar_beads()
+    except FileNotFoundError as missing:
+        pytest.skip(str(missing))
+    calibration = Calibration.from_bead(beads.scan[::2], beads.z_um[::2], 244, 230, size=29)
+    own, known = robust([of_one_bead(beads.scan[k], calibration, 244, 230, beads.z_um[k]) for k in range(7, 100, 2)])
+    assert own < 1.6 and known > 0.95
+    table = with_errors(batch(beads.frames, calibration, progress=False), calibration)
+    pairs = match(table, beads.truth, within_px=3, within_um=5)
+    ratio = pairs["dz_um"].to_numpy() / table["z_std_um"].to_numpy()[pairs["measured"]]
+    assert robust(ratio)[0] > 3  # the docstring says so
 
 
 def test_overlap_makes_them_larger() -> None:

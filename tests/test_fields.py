@@ -194,6 +194,19 @@ def test_axes_may_be_whole_numbers_or_flags(tmp_path):
     assert decoded(tmp_path / "field.vtr")["z_um"].tolist() == [0, 1]
 
 
+def test_xarray_takes_a_field():
+    """As `mean_field` says."""
+    pytest.importorskip("xarray")
+    table = pd.DataFrame(
+        {"x_um": [0.5, 1.5, 1.5, 0.5], "z_um": [5.0, 5.0, 25.0, 26.0], "vx_um_s": [1.0, 2.0, 3.0, 4.0]}
+    )
+    field = mean_field(table, {"x_um": [0, 1, 2], "z_um": [0, 10, 20, 30]})
+    grid = field.set_index(["x_um", "z_um"]).to_xarray()
+    assert dict(grid.sizes) == {"x_um": 2, "z_um": 3}
+    assert grid["vx_um_s"].sel(x_um=1.5, z_um=25) == 3 and np.isnan(grid["vx_um_s"].sel(x_um=0.5, z_um=15))
+    assert grid["n"].to_numpy().tolist() == [[1, 0, 1], [1, 0, 1]]
+
+
 def test_series_names_its_files_and_times(tmp_path):
     save_paraview_tracks(TABLE, tmp_path / "tracks.pvd", 25.0)
     text = (tmp_path / "tracks.pvd").read_text()

@@ -86,6 +86,7 @@ CHANGED = [
     ("09", {"n_sub": 7, "threshold": 0.6}),
     ("10", {"noise": 60.0, "seed": 5}),
     ("11", {"E_ac": 2.4, "mean_in_view": 30.0, "crowd_in_view": 60.0}),
+    ("11", {"duration_s": 1.0, "seed": 7}),
     ("12", {"live_in_view": 25.0, "n_sub": 6, "level": 0.85, "tau_s": 0.12}),
     ("13", {"threshold": 0.6, "method": "correlation", "frame_number": 0}),
     ("14", {"image_type": "brightfield", "unequal": 0.2, "mean_in_view": 40.0}),

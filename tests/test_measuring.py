@@ -202,6 +202,30 @@ def test_the_command_line(folder, measured, capsys):
     assert main(["report", str(out)]) == BAD
 
 
+def test_images_of_8_bits_are_measured_alike(folder, measured, tmp_path):
+    """Scan and film of 8 bits by the command: z within what a grey level in place of seven makes of it."""
+    (tmp_path / "scan").mkdir()
+    for path in sorted((folder / "scan").iterdir()):
+        tifffile.imwrite(tmp_path / "scan" / path.name, eighth(tifffile.imread(path)), photometric="minisblack")
+    tifffile.imwrite(tmp_path / "film.tif", eighth(tifffile.imread(folder / "film.tif")), photometric="minisblack")
+    asked = ["--um-per-px", str(UM_PER_PX), "--method", "correlation", "--size", "31", "--rate", str(RATE)]
+    arguments = ["measure", str(tmp_path / "scan"), str(tmp_path / "film.tif"), "--out", str(tmp_path / "out")]
+    assert main([*arguments, *asked, "--window", "7"]) == 0
+    true, table = pd.read_csv(folder / "true.csv"), pd.read_csv(tmp_path / "out" / "particles.csv")
+    pairs = match(table, true, within_um=5)
+    assert len(pairs) > 0.95 * len(true) and np.sqrt((pairs["dz_um"] ** 2).mean()) < 1
+    tracks = [pd.read_csv(tmp_path / "out" / "tracks.csv"), measured.tracks]
+    assert tracks[0]["particle"].nunique() == 6
+    std = [part["vx_std_um_s"].median() for part in tracks]
+    assert std[0] < 0.8 * std[1]  # in a shorter window less of a circle is taken for a parabola
+    assert json.loads((tmp_path / "out" / "log.json").read_text())["arguments"]["window"] == 7
+
+
+def eighth(images):
+    """Images of 8 bits; the brightest of their pixels are 2400 above the background of 100."""
+    return np.clip(np.rint(images / 10), 0, 255).astype(np.uint8)
+
+
 def test_results_lie_beside_the_film_unless_told(folder):
     (folder / "here").mkdir()
     (folder / "here" / "a.b.tif").write_bytes((folder / "film.tif").read_bytes())
@@ -224,6 +248,7 @@ def test_results_lie_beside_the_film_unless_told(folder):
         ({"folder": "film.tif"}, ValueError, "folder"),
         ({"colour": "red"}, TypeError, "choices"),
         ({"cells": 3}, TypeError, "cells"),
+        ({"window": 8, "frame_rate_hz": RATE}, ValueError, "window"),
         ({"prepare": "dark"}, TypeError, "prepare"),
     ],
 )

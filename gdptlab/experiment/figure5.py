@@ -235,7 +235,11 @@ def paired_difference(errors: pd.DataFrame, one: str, other: str) -> tuple[float
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line ``python -m gdptlab sweep``; give its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m gdptlab sweep", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m gdptlab sweep",
+        description=f"{__doc__.splitlines()[0]} This takes about an hour with all films (the card in the folder says "
+        "how long it took last). It may be stopped at any time: the same command goes on where it was.",
+    )
     parser.add_argument("--films", type=int, default=20, help="films of each kind (20)")
     parser.add_argument("--frames-timed", type=int, default=12, help="frames on which evaluations are timed (12)")
     parser.add_argument("--films-plain", type=int, help="films for the plain evaluator (as many)")

@@ -102,6 +102,7 @@ def measure(
     um_per_px: float | None = None,
     frame_rate_hz: float | None = None,
     search_range_um: tuple[float, float, float] | None = None,
+    window: int = 11,
     cells: tuple[int, int, int] = CELLS,
     depth_factor: float | tuple[float, float] | None = None,
     side: str | None = None,
@@ -132,6 +133,9 @@ def measure(
     search_range_um : (x, y, z), optional
         As for `tracking.link`. If not given, `NEIGHBOUR` of the distance between neighbours, and `DEPTH` of the range
         of depths.
+    window : int
+        Measured frames, odd, from which each velocity is taken, if particles are linked (`tracking.velocities`). The
+        longer, the less noise, and the more of a bend is taken for straight.
     cells : (x, y, z)
         How many cells the mean velocity field has along each axis, if particles are linked (`tracking.mean_field`).
     depth_factor : float or (n_immersion, n_sample), optional
@@ -166,7 +170,10 @@ def measure(
     if unknown:
         raise TypeError(f"choices: got {', '.join(unknown)}, allowed are {', '.join((*OF_SCAN, *OF_FRAMES))}")
     if frame_rate_hz is not None:
+        from gdptlab.tracking.tracks import checked_window
+
         positive("frame_rate_hz", frame_rate_hz)
+        checked_window(window)  # now, not when the film has been measured
     if not isinstance(cells, tuple | list) or len(cells) != 3:
         raise TypeError(f"cells: got {cells!r}, allowed are three whole numbers: along x, y and z")
     cells = tuple(whole("cells", n, 1, 1000) for n in cells)
@@ -215,8 +222,8 @@ def measure(
     particles = in_um(particles, um_per_px)
     if frame_rate_hz is not None:
         ranges = search_range_um or _search_range(particles, calibration.z_um)
-        tracks = _tracked(particles, frame_rate_hz, ranges, prepare or Preparation())
-        given |= {"search_range_um": tuple(ranges), "cells": cells}
+        tracks = _tracked(particles, frame_rate_hz, ranges, window, prepare or Preparation())
+        given |= {"search_range_um": tuple(ranges), "window": window, "cells": cells}
     measured = Measured(folder, calibration, quality, settings, particles, tracks)
     _write(measured, frames_used, um_per_px, frame_rate_hz, {"inputs": inputs, "arguments": given | choices})
     return measured
@@ -353,7 +360,7 @@ def _search_range(particles: pd.DataFrame, z_um: NDArray) -> tuple[float, float,
 
 
 def _tracked(
-    particles: pd.DataFrame, frame_rate_hz: float, search_range: ArrayLike, prepare: Preparation
+    particles: pd.DataFrame, frame_rate_hz: float, search_range: ArrayLike, window: int, prepare: Preparation
 ) -> pd.DataFrame:
     """Tracks with velocities; where not every frame was measured, linked from one that was to the next."""
     from gdptlab.tracking import link, velocities
@@ -361,7 +368,7 @@ def _tracked(
     counted = particles.assign(frame=(particles["frame"] - prepare.first) // prepare.every)
     n = counted["frame"].nunique()
     tracks = link(counted, search_range=search_range, predictor="nearest velocity", min_rows=min(10, (n + 1) // 2))
-    tracks = velocities(tracks, frame_rate_hz / prepare.every)
+    tracks = velocities(tracks, frame_rate_hz / prepare.every, window=window)
     return tracks.assign(frame=prepare.first + prepare.every * tracks["frame"])
 
 

@@ -10,7 +10,7 @@ from gdptlab._checks import LARGEST, numbers, positive, table
 from gdptlab.calibration import Calibration, checked
 from gdptlab.denoising import noise_level, signal_to_noise
 from gdptlab.fit.bounds import expected_error
-from gdptlab.fit.mismatch import mismatch_error_um
+from gdptlab.fit.mismatch import MODEL, mismatch_error_um
 from gdptlab.pipeline.without_stage import FilmReport
 
 AMBIGUOUS = 0.95
@@ -283,8 +283,9 @@ def _mismatch(mismatch: pd.DataFrame, span: float) -> Judgement:
     finding = f"{mismatch['n'].sum()} particles, in too few places to compare"
     if len(known):
         finding = (
-            f"mean images of {known['n'].sum()} particles differ by {_from_to(100 * known['mismatch'], '.1f')} %, by "
-            f"{_from_to(100 * known['own'], '.1f')} % with the calibration's noise alone"
+            f"mean images of {known['n'].sum()} particles differ by {_from_to(100 * known['mismatch'], '.1f')} %; "
+            f"the calibration's noise alone makes {_from_to(100 * known['own'], '.1f')} %, and its model up to "
+            f"{100 * MODEL:.1f} %"
         )
     finding += f"; this may stand for {error_um:.2g} µm of z" if error_um else ""
     finding += "; a focus that moved, which shifts all z alike, cannot be seen"

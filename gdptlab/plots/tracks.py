@@ -255,5 +255,5 @@ def energy_intervals(tables: Mapping[str, pd.DataFrame], true: float, names: Map
             )
         panel.axhline(0, color="black", lw=0.8)
         panel.set(xlabel="film, sorted", ylabel="deviation (%)", title=names[key])
-        panel.legend(fontsize="small", loc="upper left")
+        panel.legend(fontsize="small", loc="lower right", bbox_to_anchor=(1, 1), ncols=2)  # above: no interval is there
     return figure

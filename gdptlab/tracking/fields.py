@@ -38,7 +38,8 @@ def mean_field(
         and `n_particles`, how many particles they are of (without a column `particle`, each row is one); of each value
         the mean, NaN in an empty cell, and the standard error of the mean, as in `vx_se_um_s`. Errors of the rows of
         one particle are not independent, those of different particles are taken to be: the standard error is from
-        the sums of deviations of each particle, NaN for a single one.
+        the sums of deviations of each particle, NaN for a single one. xarray makes a grid of it by
+        `field.set_index(list(cells)).to_xarray()`.
 
     Raises
     ------

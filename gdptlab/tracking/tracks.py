@@ -252,8 +252,7 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float | None = None, *, wind
     axes = [(column[0], column.rpartition("_")[2]) for column in columns]  # such as x, µm
     stds = [f"{axis}_std_{unit}" for axis, unit in axes]
     weighted = set(stds) <= set(tracks)
-    if whole("window", window, LEAST_ROWS, 1001) % 2 == 0:
-        raise ValueError(f"window: got {window}, allowed are odd numbers")
+    window = checked_window(window)
     if weighted and not (check_table("tracks", tracks, stds)[stds] > 0).all(axis=None):
         raise ValueError("tracks: got a standard deviation that is NaN or not above 0, allowed are those above 0")
     if frame_rate_hz is not None:
@@ -269,6 +268,13 @@ def velocities(tracks: pd.DataFrame, frame_rate_hz: float | None = None, *, wind
     for k, (axis, unit) in enumerate(axes):
         made[f"v{axis}_{unit}_s"], made[f"v{axis}_std_{unit}_s"] = fitted[:, k], std[:, k]
     return tracks.assign(**made)
+
+
+def checked_window(window: int) -> int:
+    """Window of `velocities`, frames, if it is one."""
+    if whole("window", window, LEAST_ROWS, 1001) % 2 == 0:
+        raise ValueError(f"window: got {window}, allowed are odd numbers")
+    return window
 
 
 def _slopes(
