@@ -146,3 +146,11 @@ def test_products_with_particles_are_dense_products(surface, sums, clean_stack, 
     assert np.median(off[meet]) < PRODUCTS_MEDIAN
     assert np.percentile(off[meet], 95) < PRODUCTS_95
     assert off.max() < PRODUCTS_WORST
+
+
+def test_a_frame_of_which_one_pixel_is_seen():
+    frame, weight = np.full((36, 40), 7.0, np.float32), np.zeros((36, 40), np.float32)
+    for row, column in [(0, 0), (17, 20), (35, 3)]:
+        weight[:] = 0
+        weight[row, column] = 1
+        np.testing.assert_allclose(Background(frame.shape, 4.0).fit(frame, weight), 7.0, atol=1e-3)

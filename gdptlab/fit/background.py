@@ -60,7 +60,9 @@ class Background:
         down, across = self._where
         matrix = products[down[:, None, :, None], across[None, :, None, :]].reshape(m * n, m * n).astype(np.float64)
         # Where the frame says nothing the surface stays small (in `fit`, near the median), also if that is everywhere.
-        matrix[np.diag_indices(m * n)] += 1e-6 * np.trace(matrix) / (m * n) or 1.0
+        # One pixel alone gives a matrix that the rounding errors of its products (6e-8 of the largest) make indefinite.
+        diagonal = np.diagonal(matrix)
+        matrix[np.diag_indices(m * n)] += max(1e-6 * diagonal.mean(), 2e-7 * diagonal.max()) or 1.0
         return matrix
 
     def surface(self, coefficients: NDArray) -> NDArray[np.float32]:

@@ -565,8 +565,8 @@ class _Search:
 
 
 def _left(found: Explained) -> float:
-    """Mean squared residual of a frame, in units of read noise, less that of noise."""
-    return float(np.mean(np.square(found.fit.residual), where=found.pixels.valid)) - 1
+    """Mean squared residual of a frame, in units of read noise, less that of noise; 0 where pixels are left out."""
+    return float(np.mean((np.square(found.fit.residual) - 1) * found.pixels.valid))
 
 
 def _as_they_are(places: NDArray[np.float64], _: NDArray[np.float64]) -> NDArray[np.float64]:
