@@ -91,7 +91,7 @@ def main() -> None:
         calibration = Calibration.from_stack(*film.stack(size=2 * SIZE_PX + 1), n_sub=9)
         for in_view, rate_hz in ((100.0, 25.0), (50.0, 50.0)):
             followed = film_of(rate_hz, options.seconds, in_view=in_view)
-            follower = Follower(calibration, interval_s=1 / rate_hz, cheaper=refined)
+            follower = Follower(calibration, interval_s=1 / rate_hz, cheaper=refined, threads=2)
             with OwnProcess(follower) as apart:
                 for with_panel in (False, True):
                     status, _ = watched(device, followed, apart, with_panel)

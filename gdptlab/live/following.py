@@ -38,10 +38,11 @@ SLOW = 3
 Chosen: one slow frame, such as the first or one that is searched anew, costs some dropped frames, and the fit bridges
 them. With 1, each of these would cost a wrong fraction as well; with 10, the monitor would be late for a second."""
 
-LONGEST = 64
-"""Largest number of frames that are left to the cheaper evaluator at a time. Chosen: 2.6 s at 25 frames/s. With 8, a
-machine that is too slow for good would spend a tenth of its time on trying; with 1000, it would stay coarse for a
-minute after the machine is free again."""
+LONGEST_S = 0.1
+"""Longest time, s, that is left to the cheaper evaluator at once: much less than FORGET_S, so that the fit goes on where
+it was. Chosen between 0.08 and 2.6 s with `tests/benchmark_live.py` on two cores, where a fit takes about as long as the
+interval: of 500 frames, 25 a second with 100 in view, 251 are dropped with 2.6 s, 34 with 0.3, 14 with 0.08; after
+2.6 s particles are sought anew, which takes a second when they have lined up, and frames are left again."""
 
 
 class Follower:
@@ -169,7 +170,8 @@ class Follower:
         if self._slow < SLOW:
             return ""
         self._slow = 0  # a trial may begin with a search, which is slow once
-        self._left, self._pause = self._pause, min(2 * self._pause, LONGEST)
+        self._left = self._pause
+        self._pause = min(2 * self._pause, max(int(LONGEST_S / self._interval_s), 1))
         took = f"{1e3 * took_s:.0f} ms, allowed {1e3 * self._interval_s:.0f}"
         return f"the joint fit took {took}: the next {self._left} by the cheaper evaluator"
 
