@@ -39,10 +39,10 @@ Chosen: one slow frame, such as the first or one that is searched anew, costs so
 them. With 1, each of these would cost a wrong fraction as well; with 10, the monitor would be late for a second."""
 
 LONGEST_S = 0.1
-"""Longest time, s, that is left to the cheaper evaluator at once: much less than FORGET_S, so that the fit goes on where
-it was. Chosen between 0.08 and 2.6 s with `tests/benchmark_live.py` on two cores, where a fit takes about as long as the
-interval: of 500 frames, 25 a second with 100 in view, 251 are dropped with 2.6 s, 34 with 0.3, 14 with 0.08; after
-2.6 s particles are sought anew, which takes a second when they have lined up, and frames are left again."""
+"""Longest time, s, that is left to the cheaper evaluator at once: much less than FORGET_S, so that the fit goes on
+where it was. Chosen between 0.08 and 2.6 s with `tests/benchmark_live.py` on two cores, where a fit takes about as long
+as the interval: of 500 frames, 25 a second with 100 in view, 251 are dropped with 2.6 s, 34 with 0.3, 14 with 0.08;
+after 2.6 s particles are sought anew, which takes a second when they have lined up, and frames are left again."""
 
 
 class Follower:
