@@ -471,6 +471,9 @@ class Calibration:
         the sign of the tilt, which turns z over; a pattern that changes over the field along the axis, which is taken
         for its change with depth; a focal surface that is tilted or curved, which adds to the slide's plane.
 
+        A warning says so if more than 5 % of the beads are measured more than 5 % of the depth off the plane, by the
+        last calibration but one: then the axis is wrong, beads lie too close, or dirt was taken for beads.
+
         Parameters
         ----------
         frames : array (F, rows, columns)
@@ -492,7 +495,8 @@ class Calibration:
         Raises
         ------
         TypeError, ValueError
-            If an argument is not of that form, or too few beads stand alone.
+            If an argument is not of that form, if too few beads stand alone, or if beads on this plane do not explain
+            the frames.
         """
         from gdptlab.pipeline.tilt import calibration_of_tilt
 

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from gdptlab import Calibration, locate, match
-from gdptlab.pipeline.tilt import _plane
+from gdptlab.pipeline.tilt import _on_plane, _plane, _single
 
 TILT_DEG, UM_PER_PX, SIDE = 13.5, 0.65, 560
 
@@ -42,6 +42,29 @@ def test_the_plane_rises_along_the_axis(axis) -> None:
     table = pd.DataFrame({"x_px": [0.0, 9.5, 19.0], "y_px": [29.0, 14.5, 0.0]})
     expected = {"x": [-4.75, 0, 4.75], "y": [7.25, 0, -7.25]}[axis]
     np.testing.assert_allclose(_plane(table, axis, 0.5, (30, 20)), expected)
+
+
+def test_two_beads_that_look_like_one_are_told_by_their_image() -> None:
+    rng = np.random.default_rng(4)
+    z_um = rng.permutation(np.linspace(-40, 40, 90))
+    points = np.column_stack([np.cos(z_um / 40), np.sin(z_um / 40)]) + rng.normal(0, 0.01, (90, 2))
+    points[[7, 30]] += 0.4
+    one = _single(points, z_um)
+    assert not one[[7, 30]].any() and one.mean() > 0.85
+
+
+def test_beads_beyond_the_slices_are_on_the_plane_if_it_is_beyond() -> None:
+    plane = np.linspace(-50, 50, 101)
+    found = pd.DataFrame({"frame": 0, "x_px": plane, "y_px": 0.0, "z_um": np.clip(plane, -50, 30)})
+    found.loc[40, "z_um"] += 20
+    labels, off_um = _on_plane(found, plane, np.linspace(-50, 30, 9))
+    np.testing.assert_allclose(off_um, np.where(np.arange(101) == 40, 20, 0), atol=1e-9)
+    np.testing.assert_allclose(labels["z_um"], plane)
+
+
+def test_a_wrong_axis_is_noticed(microscope) -> None:
+    with pytest.warns(UserWarning, match="off the plane of this tilt.* check the axis"):
+        calibrated(slide(microscope, steps=(0.0, 4.0)), axis="y", size=63)
 
 
 @pytest.mark.parametrize(

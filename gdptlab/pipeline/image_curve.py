@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from gdptlab.pipeline.lone_images import BLUR_PX, LoneImages
+from gdptlab.pipeline.lone_images import BLUR_PX
 
 SLICES = 41
 """Number of images of the calibration, evenly spread along the curve."""
@@ -118,12 +118,12 @@ def ordered(points: NDArray, particle: NDArray) -> Curve:
     for _ in range(ROUNDS):
         place, off = _projected(points, curve)
         used = off < OFF_CURVE * np.median(off)
-        weights = _weights(place[used], np.linspace(0, 1, SLICES))
+        weights = line_weights(place[used], np.linspace(0, 1, SLICES))
         curve = _unit(weights @ points[used])
     place, off = _projected(points, curve)
     used = off < OFF_CURVE * np.median(off)
     more = BEYOND / (SLICES - 1)
-    return Curve(place, used, _weights(place[used], np.linspace(-more, 1 + more, SLICES + 2 * BEYOND)), gap)
+    return Curve(place, used, line_weights(place[used], np.linspace(-more, 1 + more, SLICES + 2 * BEYOND)), gap)
 
 
 def _nodes(points: NDArray, particle: NDArray) -> tuple[NDArray, float]:
@@ -152,7 +152,7 @@ def _projected(points: NDArray, curve: NDArray) -> tuple[NDArray, NDArray]:
     return (start[k] + fraction[each, k] * length[k]) / start[-1], off[each, k]
 
 
-def _weights(place: NDArray, grid: NDArray) -> NDArray:
+def line_weights(place: NDArray, grid: NDArray) -> NDArray:
     """Weights (k, n) of values at places (n,) in their local linear regression at the points of a grid (k,)."""
     away = place - grid[:, None]
     count = min(IMAGES_EACH, len(place)) - 1
@@ -163,12 +163,14 @@ def _weights(place: NDArray, grid: NDArray) -> NDArray:
     return kernel * (second - away * first) / (total * second - first**2)
 
 
-def first_stack(lone: LoneImages, curve: Curve) -> NDArray[np.float32]:
-    """Images (SLICES + 2 BEYOND, s, s) along the curve, with the amplitude that particles have there on average."""
-    images = lone.images[curve.used]
+def first_stack(images: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Averages (k, s, s) of images (n, s, s) by weights (k, n), with the amplitude that they have there on average.
+
+    The first and the last `BEYOND` averages are extrapolated.
+    """
     norm = np.stack([np.linalg.norm(cv2.GaussianBlur(image, (0, 0), BLUR_PX)) for image in images])
-    amplitude = np.exp(curve.weights @ np.log(norm))
-    stack = np.tensordot(curve.weights, images / norm[:, None, None], axes=1) * amplitude[:, None, None]
+    amplitude = np.exp(weights @ np.log(norm))
+    stack = np.tensordot(weights, images / norm[:, None, None], axes=1) * amplitude[:, None, None]
     for k in (*range(BEYOND), *range(-BEYOND, 0)):
         stack[k] = cv2.GaussianBlur(stack[k], (0, 0), BLUR_PX)  # noise grows where it is extrapolated
     return stack.astype(np.float32)

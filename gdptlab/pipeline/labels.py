@@ -28,6 +28,11 @@ PER_SLICE, SLICES = 15, (8, 61)
 """Particles for each slice of the calibration, and the least and largest number of slices. Chosen on rendered frames
 of 400 particles: with 26 slices the RMS error of z is 0.25 um, with 51 it is 0.28."""
 
+PER_FIRST, FIRST = 8, 25
+"""Particles for each slice up to that number of slices: between few slices images change too much. Chosen on a tilted
+slide with 180 labels in 104 um, seed 2: with 12 slices the RMS error of z is 0.23 um, 1.4 of its standard deviation,
+with 22 it is 0.19 um and 0.9."""
+
 COARSE = 9
 """Number of slices of the coarse patterns from which the size is read, and by which tables are compared."""
 
@@ -120,7 +125,8 @@ def checked_labels(frames: ArrayLike, table: pd.DataFrame) -> tuple[NDArray[np.f
 
 def _slices(z_um: NDArray[np.float64]) -> NDArray[np.float64]:
     """Depths of the slices that these particles support; a warning says where there are none."""
-    slices = np.linspace(z_um.min(), z_um.max(), int(np.clip(len(z_um) // PER_SLICE, *SLICES)))
+    count = max(len(z_um) // PER_SLICE, min(len(z_um) // PER_FIRST, FIRST))
+    slices = np.linspace(z_um.min(), z_um.max(), int(np.clip(count, *SLICES)))
     at = np.sort(z_um)
     gaps = np.flatnonzero(np.diff(at) > GAP * (slices[1] - slices[0]))
     if len(gaps):

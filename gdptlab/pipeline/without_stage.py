@@ -120,7 +120,7 @@ def calibrated(
     particle = particles(lone.table, points, lone.images.shape[-1])
     _must_be_enough(lone, len(np.unique(particle)))
     curve = ordered(points, particle)
-    stack = first_stack(lone, curve)
+    stack = first_stack(lone.images[curve.used], curve.weights)
     pixels = _pixels(stack[BEYOND:-BEYOND])
     if (pixels[:OUTER].mean() > pixels[-OUTER:].mean()) != reverse:
         stack, curve = stack[::-1], replace(curve, along=1 - curve.along)
