@@ -296,6 +296,12 @@ def test_impossible_microscopes(parameters, name):
         Microscope(**parameters)
 
 
+def test_numbers_of_little_precision_become_floats():
+    assert type(Microscope(na=np.float32(0.25)).na) is float
+    with pytest.raises(ValueError, match=r"^n_lens"):
+        Microscope(n_lens=np.float32(0.5), n_medium=1e308)
+
+
 def test_unknown_names_and_changes_are_refused(microscope):
     with pytest.raises(TypeError, match="magnfication"):
         Microscope(magnfication=10)

@@ -171,6 +171,13 @@ def test_a_perfect_evaluator_makes_no_error():
     assert (slow["decision_error_s"] > 0.1 - 1e-9).all()
 
 
+def test_times_that_are_no_numbers_are_refused():
+    film = small_film()
+    table = sweep([film], [perfect(film)], progress=False)
+    with pytest.raises(ValueError, match=r"^table"):
+        errors(table.assign(t_s=np.inf), 0.1)
+
+
 def test_dropped_frames_are_those_before_the_trigger():
     film = small_film()
     table = sweep([film], [perfect(film)], progress=False)

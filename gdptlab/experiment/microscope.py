@@ -107,10 +107,9 @@ class Microscope:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "focus_um":
-                number(field.name, value)
-            elif field.name != "cylinder_um" or value is not None:
-                positive(field.name, value)
+            if field.name != "cylinder_um" or value is not None:
+                check = number if field.name == "focus_um" else positive
+                object.__setattr__(self, field.name, check(field.name, value))  # float32 would overflow in what follows
         if not self.na < 1:
             raise ValueError(f"na: got {self.na}, allowed is a number between 0 and 1 (a lens in air)")
         if not self.n_lens > self.n_medium:

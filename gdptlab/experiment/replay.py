@@ -491,6 +491,7 @@ def errors(
         "true_w_s",
     ]
     table = check_table("table", table, columns).astype(dict.fromkeys(columns[1:], float))
+    numbers("table, column t_s", table["t_s"])
     if tau_s is None and "tau_s" not in table:
         raise ValueError("tau_s: got None, allowed is a number above 0 where the table has no column tau_s")
     keys = [name for name in table.columns[: table.columns.get_loc("frame")] if name != "tau_s"]
