@@ -20,7 +20,7 @@ frame's edge.
 """
 
 from collections.abc import Container, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import count, islice, product
 
@@ -372,10 +372,11 @@ def in_blocks(
     jobs = (delayed(_located)(block, first, calibration, settings) for first, block in _blocks(frames, done))
     # What joblib puts into shared memory stays there until the last frame: of a long film too much.
     how = {"pre_dispatch": "n_jobs + 1", "max_nbytes": None, "initializer": leave_with_parent}
-    for first, n, table in Parallel(n_jobs, return_as="generator", **how)(jobs):
-        if isinstance(table, Exception):
-            raise table
-        yield first, n, table
+    with closing(Parallel(n_jobs, return_as="generator", **how)(jobs)) as measured:  # in this thread, not by gc
+        for first, n, table in measured:
+            if isinstance(table, Exception):
+                raise table
+            yield first, n, table
 
 
 def _blocks(frames: Iterable[ArrayLike], done: Container[int]) -> Iterator[tuple[int, Iterable[NDArray]]]:
