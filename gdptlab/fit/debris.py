@@ -35,7 +35,7 @@ def covered_pixels(
     places : float64 array (n, 2 or more)
         y, x (px) of rows that no pattern explains.
     before : bool array (rows, columns)
-        What debris covered in the frame before, for debris that moves little.
+        What debris covered before: it still does where the residual is far beyond noise.
     size : float
         Rows and columns of a template, px.
 

@@ -56,7 +56,8 @@ whose particles line up, 25 to 100 in view: there 0 to 0.5 is reached at first, 
 diameters that differ 0.7 to 1.1."""
 
 SPLITS = 4
-"""Largest number of times that particles of a crowd are tried as two."""
+"""Largest number of times that particles of a crowd are tried as two. Chosen between 2 and 4 on thirteen frames of the
+films of `CROWDED`: 4 finds 30 particles more in three of them, and 15 fewer in one."""
 
 KNOTS = (8.0, 2.0, 1.0, 0.5)
 """Distances between the knots of the background that are tried, in templates."""
@@ -294,7 +295,10 @@ class Joint:
         return suitable(self._small_backgrounds, self.reduced(light), self.reduced(weight), self._blur, CLEARLY_FINER)
 
     def following(self, frame: NDArray[np.float32], before: Explained) -> Explained:
-        """Explain the frame after one that is explained. A particle that appears in it is in the table of the next."""
+        """Explain the frame after one that is explained. A particle that appears in it is in the table of the next.
+
+        Debris is not sought in it; what was covered before may be seen again.
+        """
         pixels = usable_pixels(frame, before.pixels.noise)
         pixels = replace(pixels, valid=pixels.valid & ~before.covered)
         frame = self._normalised(pixels)
@@ -565,11 +569,12 @@ class _Search:
 
 
 def _left(found: Explained) -> float:
-    """Mean squared residual of a frame, in units of read noise, less that of noise; 0 where pixels are left out."""
+    """Mean over a frame of its squared residual, in units of read noise, less 1; pixels that are left out count 0."""
     return float(np.mean((np.square(found.fit.residual) - 1) * found.pixels.valid))
 
 
 def _as_they_are(places: NDArray[np.float64], _: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places (P, 4 + K) of which none are merged, in the stead of `Level.merged`."""
     return places
 
 

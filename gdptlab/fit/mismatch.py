@@ -47,7 +47,8 @@ calibrations, not chosen on, 0.004 flags 0 of 40, 9 of 24 and 24 of 24."""
 
 SURE = 2.5
 """Significance, standard deviations, from which on a mismatch is more than noise. Chosen on frames of three
-calibrations: it is at most 0.6 in any bin with unchanged optics, and 3.3 or more in one with 1 % more magnification."""
+calibrations, before `MODEL` was subtracted: it was at most 0.6 in any bin with unchanged optics, and 3.3 or more in one
+with 1 % more magnification."""
 
 ABSORBED = 2.0
 """Error of z that the fit has absorbed, over what the residual would be if it were all along z. Chosen on the same: it

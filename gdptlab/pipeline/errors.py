@@ -21,9 +21,9 @@ def with_errors(table: pd.DataFrame, calibration: Calibration) -> pd.DataFrame:
 
     They are those that the residual of each particle implies, as if it were white noise, and the calibration's own
     error at its depth. Where particles overlap, the neighbour is part of the residual, and they grow; of errors
-    that it makes in the same direction they cannot know. Nor of particles that differ from the calibration's: of a real
-    bead the error is as stated, to a factor of 1.4, if it is measured by its own images, and some times larger by those
-    of another bead.
+    that it makes in the same direction they cannot know. Nor of particles that differ from the calibration's: for a
+    real bead the error is as stated, to a factor of 1.4, if it is measured by its own images, and several times larger
+    by those of another bead.
 
     Parameters
     ----------
